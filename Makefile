@@ -1,0 +1,55 @@
+# Everything runs from .venv, which make builds itself from the locked versions in requirements.lock.
+PYTHON ?= $(firstword $(shell command -v python3.11 python3.12 python3.13 python3))
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# Two workers: most of the suite is compiling, which keeps one core busy each.
+PYTEST := $(BIN)/python -m pytest -n 2
+
+.PHONY: setup demo test test-browser test-parity test-slow lint bench lock clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make setup   build .venv from the locked versions"
+	@echo "make demo    reconstruct the bundled 4-camera capture into out/demo"
+	@echo "make test    the default test suite (under 10 minutes on 2 cores)"
+	@echo "make lint    ruff and pyright"
+	@echo "make bench   print the speed tables of benchmarks/"
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml requirements.lock
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	@touch $@
+
+demo: setup
+	$(BIN)/poem demo --out out/demo
+
+test: setup
+	$(PYTEST)
+
+test-browser: setup
+	@command -v chromium >/dev/null || { apt-get update -qq && apt-get install -y -qq chromium >/dev/null; }
+	$(BIN)/python -m pytest -m browser
+
+test-parity: setup
+	$(PYTEST) -m parity
+
+test-slow: setup
+	$(PYTEST) -m slow
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+bench: setup
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+lock: setup
+	$(BIN)/pip-compile --quiet --strip-extras --no-emit-options --no-emit-index-url --no-emit-find-links --extra dev --extra viz --output-file requirements.lock pyproject.toml
+
+clean:
+	rm -rf $(VENV) out

@@ -1,0 +1,52 @@
+"""poem_jax: metric 3D hands from any number of calibrated cameras.
+
+The public surface is lazy: importing the package imports neither JAX nor Flax, so data workers stay light.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from poem_jax.batch import MultiViewBatch, Prediction
+    from poem_jax.geometry.cameras import Cameras
+    from poem_jax.hand.model import HandModel
+    from poem_jax.models.poem import apply, init, preset
+    from poem_jax.weights.store import load, save
+
+_HOME = {
+    "Cameras": "poem_jax.geometry.cameras",
+    "HandModel": "poem_jax.hand.model",
+    "MultiViewBatch": "poem_jax.batch",
+    "Prediction": "poem_jax.batch",
+    "apply": "poem_jax.models.poem",
+    "init": "poem_jax.models.poem",
+    "load": "poem_jax.weights.store",
+    "preset": "poem_jax.models.poem",
+    "save": "poem_jax.weights.store",
+}
+_ROOMS = ("evaluation", "geometry", "hand", "models")
+
+__version__ = "0.1.0"
+__all__ = [
+    "Cameras",
+    "HandModel",
+    "MultiViewBatch",
+    "Prediction",
+    "apply",
+    "init",
+    "load",
+    "preset",
+    "save",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    if name in _ROOMS:
+        return importlib.import_module(f"poem_jax.{name}")
+    raise AttributeError(f"module 'poem_jax' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME, *_ROOMS])

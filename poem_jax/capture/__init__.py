@@ -1,0 +1,1 @@
+"""Rigs, captures and the reconstruction pipeline."""

@@ -1,0 +1,256 @@
+"""Where the hands are: files of boxes or of 2D key points, one entry per frame, hand and view.
+
+Letters: F frames, H hands (tracks: a hand keeps its place in every frame), V views in the rig's order. Two
+kinds of npz are read:
+
+    boxes       `boxes_px (F, H, V, 4)` x0 y0 x1 y1, NaN = unseen; `hand_side (H,)` 'left' or 'right'
+    key points  `keypoints_px (F, H, V, 21, 2)` OpenPose order, NaN = unseen; `hand_side (H,)`
+
+both in pixels of the raw (distorted) images, both with an optional `frames (F,)` of names or numbers. Key
+points may have a `confidence (F, H, V, 21)`, NaN = unseen: those below `MIN_CONFIDENCE` count as unseen, and
+so do those at exactly (0, 0), where detectors put what they do not find. Key points count pixels from the
+centre of the top-left one, as detectors and calibrations do, and are moved by half a pixel here; a box gives
+edges, so that the whole image is 0 0 W H.
+"""
+
+import logging
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from poem_jax.capture.rig_file import HALF_PIXEL
+from poem_jax.hand.topology import NUM_JOINTS
+from poem_jax.io.atomic import whole_file
+from poem_jax.typing import Array, Float, Int
+
+SIDES = ("left", "right")
+HOW_TO_GET_BOXES = (
+    "say where the hands are: an npz with `boxes_px (F, H, V, 4)` (x0 y0 x1 y1 in the raw images, NaN = "
+    "unseen) or `keypoints_px (F, H, V, 21, 2)`, and `hand_side (H,)`; pass it by --boxes or put it beside "
+    "the images as boxes.npz (docs/captures.md shows how to make one)"
+)
+MIN_KEYPOINTS = 5
+"""Fewer key points than this do not say where a hand is."""
+MIN_CONFIDENCE = 0.2
+"""A key point that its detector trusts less than this is dropped; zero is below it."""
+
+_log = logging.getLogger(__name__)
+
+
+class HandBoxes(NamedTuple):
+    """The hands of a take, in pixels of the raw images, which span [0, W] x [0, H]."""
+
+    boxes_px: Float[Array, "frame hand view 4"]
+    """x0 y0 x1 y1; NaN = unseen. Of key points: the tight box of those seen."""
+    hand_side: tuple[str, ...]
+    """'left' or 'right' per hand."""
+    frames: tuple[str, ...] | None = None
+    """Frame names as the file gives them, None where it gives none."""
+    keypoints_px: Float[Array, "frame hand view 21 2"] | None = None
+    """OpenPose order; NaN = unseen; None where the file holds boxes alone."""
+
+
+def read_boxes(path: str | os.PathLike) -> HandBoxes:
+    """Read a file of boxes or key points; a file that holds both gives both.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Not an npz, neither array is there, shapes or sides are wrong, a box is empty, a
+            confidence is negative or infinite. The message names the file, what was expected and what was
+            found.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no boxes file at {path}; {HOW_TO_GET_BOXES}")
+    content = _arrays(path)
+    sides = _sides(content, path)
+    keypoints = _keypoints(content, len(sides), path)
+    boxes = _boxes(content, len(sides), path)
+    if boxes is None and keypoints is None:
+        raise ValueError(
+            f"{path} must hold `boxes_px` or `keypoints_px`; found {', '.join(content) or 'nothing'}"
+        )
+    if boxes is None:
+        assert keypoints is not None
+        boxes = boxes_from_keypoints(keypoints)
+    frames = _frames(content, len(boxes), path)
+    if keypoints is not None and keypoints.shape[:3] != boxes.shape[:3]:
+        raise ValueError(
+            f"{path}: `keypoints_px` and `boxes_px` must agree in frames, hands and views; "
+            f"got {keypoints.shape[:3]} and {boxes.shape[:3]}"
+        )
+    return HandBoxes(boxes, sides, frames, keypoints)
+
+
+def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
+    """Write boxes, and key points where there are any; `read_boxes` gives them back."""
+    content = {"boxes_px": boxes.boxes_px, "hand_side": np.array(boxes.hand_side)}
+    if boxes.frames is not None:
+        content["frames"] = np.array(boxes.frames)
+    if boxes.keypoints_px is not None:
+        content["keypoints_px"] = boxes.keypoints_px - HALF_PIXEL
+    # A stream, since NumPy would add a suffix to a name that has none.
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, **content)
+    return Path(path)
+
+
+def boxes_from_keypoints(keypoints_px: Float[Array, "*batch 21 2"]) -> Float[Array, "*batch 4"]:
+    """Return the tight box of the key points seen; NaN where fewer than five are, or all on one line."""
+    seen = np.isfinite(keypoints_px).all(-1, keepdims=True)
+    low = np.where(seen, keypoints_px, np.inf).min(-2)
+    high = np.where(seen, keypoints_px, -np.inf).max(-2)
+    enough = (seen.sum(-2) >= MIN_KEYPOINTS) & (high > low).all(-1, keepdims=True)
+    return np.where(enough, np.concatenate([low, high], axis=-1), np.nan)
+
+
+def without_boxes_outside(boxes: HandBoxes, size_wh: Int[Array, "view 2"]) -> HandBoxes:
+    """Return the hands with those boxes unseen that lie wholly outside their image; a warning counts them."""
+    low, high = boxes.boxes_px[..., :2], boxes.boxes_px[..., 2:]
+    outside = (high <= 0).any(-1) | (low >= size_wh).any(-1)
+    if outside.any():
+        frame, hand, view = (int(i) for i in np.argwhere(outside)[0])
+        name = frame if boxes.frames is None else boxes.frames[frame]
+        _log.warning(
+            "%d boxes lie wholly outside their images and count as unseen; the first: frame %s, hand %d, "
+            "view %d: %s",
+            *(outside.sum(), name, hand, view, boxes.boxes_px[frame, hand, view].round(1).tolist()),
+        )
+    return boxes._replace(boxes_px=np.where(outside[..., None], np.nan, boxes.boxes_px))
+
+
+def align_frames(
+    boxes: HandBoxes, names: tuple[str, ...], num_views: int, path: str | os.PathLike
+) -> HandBoxes:
+    """Return the entries of the capture's frames, in the capture's order.
+
+    Frames are matched by name, or by number ('9' is '0009'); a file without names must have as many frames as
+    the capture, and where both have but one these belong together. A frame of the capture that the file
+    does not name gets no hand.
+
+    Raises:
+        ValueError: The number of views or frames does not fit, or no name does.
+    """
+    if boxes.boxes_px.shape[2] != num_views:
+        raise ValueError(f"{path}: the rig has {num_views} views; the boxes have {boxes.boxes_px.shape[2]}")
+    if boxes.frames is None or len(names) == len(boxes.frames) == 1:
+        if len(boxes.boxes_px) != len(names):
+            raise ValueError(
+                f"{path}: the capture has {len(names)} frames, the boxes {len(boxes.boxes_px)}; "
+                "add `frames (F,)` with the frames' names to the file to say which is which"
+            )
+        return boxes._replace(frames=names)
+    twice = len(boxes.frames) - len({_frame_key(name) for name in boxes.frames})
+    if twice:
+        raise ValueError(f"{path}: `frames` must differ from each other; got {boxes.frames[:6]}")
+    row = {_frame_key(name): i for i, name in enumerate(boxes.frames)}
+    rows = np.array([row.get(_frame_key(name), -1) for name in names])
+    if (rows < 0).all():
+        raise ValueError(
+            f"{path}: no frame of the capture ({names[0]}, ...) is among its `frames` {boxes.frames[:4]}"
+        )
+    return HandBoxes(
+        _take(boxes.boxes_px, rows),
+        boxes.hand_side,
+        names,
+        None if boxes.keypoints_px is None else _take(boxes.keypoints_px, rows),
+    )
+
+
+def _take(array: Array, rows: Array) -> Array:
+    found = (rows >= 0).reshape(-1, *[1] * (array.ndim - 1))
+    return np.where(found, array[rows], np.nan)
+
+
+def _frame_key(name: str) -> str | int:
+    return int(name) if name.isdecimal() else name
+
+
+def _arrays(path: Path) -> Mapping[str, Array]:
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as content:
+            return dict(content)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, TypeError) as error:
+        raise ValueError(f"{path} must be an npz of plain arrays; it cannot be read: {error}") from error
+
+
+def _sides(content: Mapping[str, Array], path: Path) -> tuple[str, ...]:
+    if "hand_side" not in content:
+        raise ValueError(f"{path}: `hand_side (H,)` is missing; it says 'left' or 'right' for each hand")
+    sides = tuple(str(side) for side in np.atleast_1d(content["hand_side"]))
+    wrong = [side for side in sides if side not in SIDES]
+    if wrong or not sides:
+        raise ValueError(
+            f"{path}: `hand_side` must hold 'left' or 'right'; got {wrong[0] if wrong else 'none'!r}"
+        )
+    return sides
+
+
+def _keypoints(content: Mapping[str, Array], num_hands: int, path: Path) -> Array | None:
+    if "keypoints_px" not in content:
+        return None
+    keypoints = _checked(content, "keypoints_px", (num_hands, NUM_JOINTS, 2), path)
+    keypoints = np.where(np.isfinite(keypoints).all(-1, keepdims=True), keypoints, np.nan)
+    if "confidence" in content:
+        trusted = _confidence(content["confidence"], keypoints.shape[:-1], path) >= MIN_CONFIDENCE
+        keypoints = np.where(trusted[..., None], keypoints, np.nan)
+    at_zero = (keypoints == 0).all(-1, keepdims=True)
+    if at_zero.any():
+        _log.warning("%s: %d key points at exactly (0, 0) count as unseen", path, at_zero.sum())
+    return np.where(at_zero, np.nan, keypoints) + HALF_PIXEL
+
+
+def _confidence(confidence: Array, shape: tuple[int, ...], path: Path) -> Array:
+    if confidence.shape != shape or not np.issubdtype(confidence.dtype, np.number):
+        raise ValueError(
+            f"{path}: `confidence` must be numbers, one per key point, of shape {shape}; "
+            f"got {confidence.dtype} {confidence.shape}"
+        )
+    wrong = confidence[(confidence < 0) | np.isinf(confidence)]
+    if wrong.size:
+        raise ValueError(
+            f"{path}: `confidence` must be 0 or more, or NaN for unseen; got {wrong.flat[0]} "
+            "(put scores on a scale from 0 to 1)"
+        )
+    return confidence
+
+
+def _boxes(content: Mapping[str, Array], num_hands: int, path: Path) -> Array | None:
+    if "boxes_px" not in content:
+        return None
+    boxes = _checked(content, "boxes_px", (num_hands, 4), path)
+    seen = np.isfinite(boxes).all(-1)
+    empty = seen & (boxes[..., 2:] <= boxes[..., :2]).any(-1)
+    if empty.any():
+        frame, hand, view = (int(i) for i in np.argwhere(empty)[0])
+        raise ValueError(
+            f"{path}: a box is x0 y0 x1 y1 with x0 < x1 and y0 < y1; got {boxes[frame, hand, view].tolist()} "
+            f"(frame {frame}, hand {hand}, view {view})"
+        )
+    return np.where(seen[..., None], boxes, np.nan)
+
+
+def _checked(content: Mapping[str, Array], name: str, tail: tuple[int, ...], path: Path) -> Array:
+    """Return the array (frame, hand, view, *tail[1:]) as float64 with infinities turned to NaN."""
+    array = content[name]
+    expected = f"(frames, {tail[0]} hands, views, {', '.join(map(str, tail[1:]))})"
+    fits = array.ndim == len(tail) + 2 and array.shape[1] == tail[0] and array.shape[3:] == tail[1:]
+    if not fits or not np.issubdtype(array.dtype, np.number):
+        raise ValueError(
+            f"{path}: `{name}` must be numbers of shape {expected}; got {array.dtype} {array.shape}"
+        )
+    array = array.astype(np.float64)
+    return np.where(np.isfinite(array), array, np.nan)
+
+
+def _frames(content: Mapping[str, Array], num_frames: int, path: Path) -> tuple[str, ...] | None:
+    if "frames" not in content:
+        return None
+    names = tuple(str(name) for name in np.atleast_1d(content["frames"]))
+    if len(names) != num_frames:
+        raise ValueError(f"{path}: `frames` must name {num_frames} frames; got {len(names)}")
+    return names

@@ -1,0 +1,1 @@
+"""Samples and batches on the host, NumPy only."""

@@ -1,0 +1,1 @@
+"""Differentiable multi-view geometry: pure functions over any leading batch axes."""

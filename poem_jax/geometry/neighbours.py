@@ -1,0 +1,50 @@
+"""Nearest neighbours among points, and gathers by their indices."""
+
+import jax
+import jax.numpy as jnp
+
+from poem_jax.typing import Array, Float, Int, Num
+
+_GROUP = 8
+"""Points per group of the two-stage search."""
+
+
+def nearest(
+    queries: Float[Array, "*batch query 3"], points: Float[Array, "*batch point 3"], k: int
+) -> Int[Array, "*batch query k"]:
+    """Return the indices of the k points nearest to each query, nearest first; not differentiated.
+
+    The k nearest points lie in the k groups whose nearest members are nearest, so a first selection among
+    groups leaves few candidates for the second; the result is exact.
+
+    Raises: ValueError: k is not in 1..point.
+    """
+    num_points = points.shape[-2]
+    if not 1 <= k <= num_points:
+        raise ValueError(f"`k` must be between 1 and the number of points = {num_points}; got {k}")
+    negated = -_squared_distances(jax.lax.stop_gradient(queries), jax.lax.stop_gradient(points))
+    if num_points % _GROUP or num_points < 4 * _GROUP * k:
+        return jax.lax.top_k(negated, k)[1]
+    groups = negated.reshape(*negated.shape[:-1], num_points // _GROUP, _GROUP)
+    chosen = jax.lax.top_k(jnp.max(groups, axis=-1), k)[1]
+    candidates = jnp.take_along_axis(groups, chosen[..., None], axis=-2)
+    best = jax.lax.top_k(candidates.reshape(*chosen.shape[:-1], k * _GROUP), k)[1]
+    group = jnp.take_along_axis(chosen, best // _GROUP, axis=-1)
+    return group * _GROUP + best % _GROUP
+
+
+def gather(
+    features: Num[Array, "*batch point c"], indices: Int[Array, "*batch query k"]
+) -> Num[Array, "*batch query k c"]:
+    """Return the features of each query's neighbours; indices must be in range."""
+    batch, (query, k), c = indices.shape[:-2], indices.shape[-2:], features.shape[-1]
+    rows = features.reshape(-1, *features.shape[-2:])
+    flat = indices.reshape(-1, query * k)
+    taken = jax.vmap(lambda f, i: f.at[i].get(mode="promise_in_bounds"))(rows, flat)
+    return taken.reshape(*batch, query, k, c)
+
+
+def _squared_distances(queries: Array, points: Array) -> Array:
+    """Return (*batch, query, point), summed over unrolled coordinates: on CPU twice as fast as a product."""
+    differences = [queries[..., :, None, i] - points[..., None, :, i] for i in range(3)]
+    return sum(d * d for d in differences)  # pyright: ignore[reportReturnType]

@@ -1,0 +1,188 @@
+"""Open the user's MANO files: `MANO_RIGHT.pkl`, `MANO_LEFT.pkl`, or an `.npz` with MANO's field names.
+
+The pickles were written by Python 2 and hold chumpy variables and a scipy sparse matrix. Neither library is
+needed, nor is the pickle trusted: `io/safe_pickle.py` keeps their state in inert stand-ins, and the arrays
+are taken out here. MANO's mean pose is not used: as in the released models, zero pose means the flat hand.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poem_jax.hand.mano_values import as_array
+from poem_jax.hand.model import HandModel
+from poem_jax.hand.topology import (
+    MANO_PARENTS,
+    NUM_FACES,
+    NUM_POSE_FEATURES,
+    NUM_SHAPES,
+    NUM_SKELETON_JOINTS,
+    NUM_VERTICES,
+)
+from poem_jax.io.safe_pickle import StandIn, load_arrays_pickle
+
+_SHAPES = {
+    "v_template": (NUM_VERTICES, 3),
+    "shapedirs": (NUM_VERTICES, 3, NUM_SHAPES),
+    "posedirs": (NUM_VERTICES, 3, NUM_POSE_FEATURES),
+    "J_regressor": (NUM_SKELETON_JOINTS, NUM_VERTICES),
+    "weights": (NUM_VERTICES, NUM_SKELETON_JOINTS),
+    "f": (NUM_FACES, 3),
+}
+_SUM_TOLERANCE = 1e-3
+_LONGEST_HAND_M = 1.0
+
+
+def load(path: str | Path, side: str | None = None) -> HandModel:
+    """Read a hand in MANO's schema from `.pkl` or `.npz`, as float32 NumPy arrays.
+
+    Args:
+        path: the file; neither chumpy nor scipy is needed, and nothing in the file is run.
+        side: "right" or "left"; None takes it from the file's name: left if that says so, else right.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another kind of file, a damaged or hostile one, a missing field, a wrong shape or value.
+    """
+    path = Path(path)
+    if side not in (None, "right", "left"):
+        raise ValueError(f'`side` must be "right", "left" or None; got {side!r}')
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no hand model at {path}; give MANO_RIGHT.pkl or MANO_LEFT.pkl (from mano.is.tue.mpg.de), "
+            "or an .npz with MANO's field names"
+        )
+    if path.suffix == ".npz":
+        fields = _read_npz(path)
+    elif path.suffix == ".pkl":
+        fields = _read_pickle(path)
+    else:
+        raise ValueError(f"{path} must end in .pkl or .npz; got {path.suffix or 'no suffix'!r}")
+    return _hand_model(fields, str(path), side)
+
+
+def _read_npz(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as stream:
+            stored = np.load(stream, allow_pickle=False)
+            if isinstance(stored, np.ndarray):
+                raise ValueError("it holds a single array (.npy); save all of MANO's fields with numpy.savez")
+            return {name: stored[name] for name in stored.files}
+    # Damaged archives raise what zipfile, zlib, struct and NumPy's header parser happen to raise.
+    except Exception as error:
+        raise ValueError(
+            f"{path} must be an .npz of arrays; reading it stopped with {type(error).__name__}: {error}. "
+            "Is the file cut short or of another kind?"
+        ) from error
+
+
+def _read_pickle(path: Path) -> dict[str, Any]:
+    fields = load_arrays_pickle(path, stand_ins=_holds_arrays)
+    if not isinstance(fields, Mapping):
+        raise ValueError(f"{path} must hold a dictionary of MANO's fields; got a {type(fields).__name__}")
+    return {key.decode("latin1") if isinstance(key, bytes) else str(key): fields[key] for key in fields}
+
+
+def _holds_arrays(module: str, name: str) -> bool:
+    """Classes of the genuine files that are replaced by stand-ins."""
+    package = module.partition(".")[0]
+    return (package == "chumpy" and name[:1].isupper()) or (
+        module.startswith("scipy.sparse") and name in ("csc_matrix", "csr_matrix", "csc_array", "csr_array")
+    )
+
+
+def _hand_model(fields: Mapping[str, Any], source: str, side: str | None) -> HandModel:
+    missing = [name for name in _SHAPES if name not in fields]
+    if missing:
+        raise ValueError(
+            f"{source} must have the fields {', '.join(_SHAPES)}; missing: {', '.join(missing)}; "
+            f"got: {', '.join(sorted(fields)) or 'none'}. Is it a MANO hand (not SMPL, not a pose file)?"
+        )
+    arrays = {name: _checked(name, fields[name], source) for name in _SHAPES}
+    _check_values(arrays, fields.get("kintree_table"), source)
+    left = "left" in Path(source).name.lower() if side is None else side == "left"
+    return HandModel(
+        v_template=arrays["v_template"],
+        shapedirs=arrays["shapedirs"],
+        posedirs=arrays["posedirs"],
+        J_regressor=arrays["J_regressor"],
+        weights=arrays["weights"],
+        faces=arrays["f"],
+        is_left=np.array(left),
+    )
+
+
+def _checked(name: str, value: Any, source: str) -> np.ndarray:
+    """Return one field as a finite array of its type and shape."""
+    array = _array(name, value, source)
+    expected = _SHAPES[name]
+    if array is None or array.dtype.kind not in "fiu":
+        raise ValueError(f"`{name}` in {source} must be an array of numbers {expected}; got {_kind(value)}")
+    if array.shape != expected:
+        raise ValueError(f"`{name}` in {source} must have shape {expected}; got {array.shape}")
+    if name == "f":
+        _check_faces(array, source)
+        return np.ascontiguousarray(array, dtype=np.int32)
+    with np.errstate(over="ignore"):
+        array = np.ascontiguousarray(array, dtype=np.float32)
+    if not np.isfinite(array).all():
+        raise ValueError(
+            f"`{name}` in {source} must be finite; got NaN, infinity or numbers as large. "
+            "Is the file damaged?"
+        )
+    return array
+
+
+def _array(name: str, value: Any, source: str) -> np.ndarray | None:
+    try:
+        return as_array(value)
+    except ValueError as error:
+        raise ValueError(f"`{name}` in {source} is damaged: {error}") from error
+
+
+def _check_faces(faces: np.ndarray, source: str) -> None:
+    # Written so that NaN fails too.
+    if not (faces.min() >= 0 and faces.max() < NUM_VERTICES and (faces == faces.round()).all()):
+        raise ValueError(
+            f"`f` in {source} must hold vertex numbers 0..{NUM_VERTICES - 1}; "
+            f"got {faces.min()}..{faces.max()}"
+        )
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, StandIn):
+        return f"a {value.module}.{value.name} whose values were not found"
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape} of dtype {value.dtype}"
+    return f"a {type(value).__name__}"
+
+
+def _check_values(arrays: Mapping[str, np.ndarray], tree: Any, source: str) -> None:
+    extent = np.ptp(arrays["v_template"].astype(float), axis=0).max()
+    if extent > _LONGEST_HAND_M:
+        raise ValueError(
+            f"`v_template` in {source} must be in metres; got a hand {extent:.0f} long. "
+            "Divide millimetres by 1000."
+        )
+    for name in ("J_regressor", "weights"):
+        sums = arrays[name].astype(float).sum(axis=1)
+        if np.abs(sums - 1).max() > _SUM_TOLERANCE:
+            raise ValueError(
+                f"rows of `{name}` in {source} must sum to 1; "
+                f"got sums from {sums.min():.4g} to {sums.max():.4g}"
+            )
+    _check_tree(tree, source)
+
+
+def _check_tree(tree: Any, source: str) -> None:
+    """The joints must hang together as MANO's; the root's parent is written as -1 or as its unsigned wrap."""
+    if tree is None:
+        return
+    table = _array("kintree_table", tree, source)
+    expected = list(MANO_PARENTS[1:])
+    readable = table is not None and table.shape == (2, NUM_SKELETON_JOINTS) and table.dtype.kind in "fiu"
+    got = table[0, 1:].tolist() if readable else _kind(tree)  # type: ignore[index]
+    if got != expected:
+        raise ValueError(f"`kintree_table` in {source} must have MANO's parents {expected}; got {got}")

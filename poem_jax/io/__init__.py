@@ -1,0 +1,1 @@
+"""Files: untrusted pickles and meshes."""

@@ -1,0 +1,279 @@
+"""Read pickles of arrays from untrusted files: an allow-list decides what may be built, and nothing else is.
+
+A pickle is a program. This reader runs only the part of it that builds plain containers and descriptions of
+arrays; NumPy's own constructors are never handed to it, for a forged dtype or array state can crash the
+interpreter. When the whole pickle has been read, the descriptions, checked by then, become arrays. Classes of
+other libraries that are known to hold arrays (scipy's sparse matrices, chumpy's variables) become inert
+stand-ins that merely keep their state. Any other global is refused by name before anything of it is imported.
+"""
+
+import codecs
+import io
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+from poem_jax.io.stored_array import StoredArray, StoredDtype, refuse_change
+
+_NUMPY_CORE = ("numpy.core", "numpy._core")
+_BUILTINS = ("builtins", "__builtin__")
+_DEEPEST = 100
+_PLAIN = (str, bytes, int, float, bool, type(None))
+_KEYS = {
+    pickle.SETITEM: slice(-2, -1),
+    pickle.SETITEMS: slice(0, None, 2),
+    pickle.DICT: slice(0, None, 2),
+    pickle.ADDITEMS: slice(None),
+    pickle.FROZENSET: slice(None),
+}
+"""Where the keys lie on the reader's stack when an operation hashes them."""
+
+
+class StandIn:
+    """Keeps the state that a pickle gives to an object of a foreign class, and does nothing."""
+
+    module = ""
+    name = ""
+    state: dict[str, Any]
+    __hash__ = None  # type: ignore[assignment]
+
+    def __new__(cls, *args: Any) -> "StandIn":
+        """Make it with an empty state: a pickle does not call `__init__`."""
+        made = super().__new__(cls)
+        made.state = {}
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        # Objects with slots come as (dictionary, slots).
+        parts = state if isinstance(state, tuple) else (state,)
+        for part in parts:
+            if isinstance(part, dict):
+                self.state.update({_text(key): value for key, value in part.items()})
+
+    def __repr__(self) -> str:
+        return f"StandIn({self.module}.{self.name}: {sorted(self.state)})"
+
+
+def load_arrays_pickle(
+    path: str | Path, stand_ins: Callable[[str, str], bool] = lambda module, name: False
+) -> Any:
+    """Read a pickle that may hold NumPy arrays, plain containers and allowed stand-ins.
+
+    Args:
+        path: the file; pickles of Python 2 are read with latin-1 strings.
+        stand_ins: True for the (module, name) of a class that may be replaced by a `StandIn`. The state of
+            a stand-in is whatever the file says, itself included: follow it with care.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no pickle, is cut short, asks for a global outside the allow-list, or
+            describes arrays that are not of plain numbers or not of the size of their bytes.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file at {path}; give the path of a pickle of arrays")
+    return loads_arrays_pickle(path.read_bytes(), stand_ins=stand_ins, source=str(path))
+
+
+def loads_arrays_pickle(
+    data: bytes,
+    stand_ins: Callable[[str, str], bool] = lambda module, name: False,
+    source: str = "the pickle",
+) -> Any:
+    """Read a pickle from memory; see `load_arrays_pickle`. `source` names it in messages."""
+    reader = _Reader(io.BytesIO(data), stand_ins, source)
+    try:
+        return _Finisher().finish(reader.load())
+    except _Refused as error:
+        raise ValueError(str(error)) from None
+    except RecursionError as error:
+        raise ValueError(f"{source} nests too deeply to be a file of arrays") from error
+    except Exception as error:
+        raise ValueError(
+            f"{source} must be a whole pickle of arrays; reading it stopped with "
+            f"{type(error).__name__}: {error}. Is the file cut short or of another kind? Fetch it again."
+        ) from error
+
+
+class _Refused(Exception):
+    """A global outside the allow-list."""
+
+
+# Python's own reader, not the one in C: that one allocates whatever a memo number or a length asks for.
+class _Reader(pickle._Unpickler):
+    dispatch: ClassVar[dict] = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
+
+    def __init__(self, stream: io.BytesIO, stand_ins: Callable[[str, str], bool], source: str):
+        super().__init__(stream, encoding="latin1")
+        self._stand_ins = stand_ins
+        self._source = source
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _ALLOWED:
+            return _ALLOWED[module, name]
+        if self._stand_ins(module, name):
+            return type("StandIn", (StandIn,), {"module": module, "name": name})
+        raise _Refused(
+            f"{self._source} asks for {module}.{name}, which is not needed to hold arrays and is refused; "
+            "expected only NumPy arrays and plain containers. Do not trust this file."
+        )
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise _Refused(f"{self._source} refers to an object outside itself, which is refused")
+
+    def get_extension(self, code: int) -> Any:
+        raise _Refused(f"{self._source} refers to a registered extension ({code}), which is refused")
+
+
+def _with_plain_keys(operation: Callable[[Any], None], where: slice) -> Callable[[Any], None]:
+    def checked(reader: Any) -> None:
+        # Hashing deeply nested tuples overflows the interpreter's stack.
+        _check_keys(reader.stack[where])
+        operation(reader)
+
+    return checked
+
+
+def _check_keys(keys: Any) -> None:
+    for key in keys:
+        if not isinstance(key, _PLAIN):
+            raise ValueError(f"keys must be text or numbers; got a {type(key).__name__}")
+
+
+for _code, _where in _KEYS.items():
+    _Reader.dispatch[_code[0]] = _with_plain_keys(_Reader.dispatch[_code[0]], _where)
+# A bytearray would be allocated before it is known whether the file is that long.
+_Reader.dispatch[pickle.BYTEARRAY8[0]] = _Reader.dispatch[pickle.BINBYTES8[0]]
+
+
+class _Finisher:
+    """Puts arrays in the place of their descriptions: in place but for tuples, each object once."""
+
+    def __init__(self) -> None:
+        # The original is kept beside what became of it, so that its id is not given to another object.
+        self._done: dict[int, tuple[Any, Any]] = {}
+
+    def finish(self, value: Any, depth: int = 0) -> Any:
+        """Return what stands for `value` in the result.
+
+        Raises:
+            ValueError: containers too deep in each other, a tuple within itself, or something that is
+                neither data nor a container of data.
+        """
+        if isinstance(value, _PLAIN):
+            return value
+        if depth > _DEEPEST:
+            raise ValueError(f"containers nest more than {_DEEPEST} deep")
+        if id(value) not in self._done:
+            # Lists, dictionaries and stand-ins stay who they are, so they may hold themselves.
+            self._done[id(value)] = (value, _UNFINISHED if isinstance(value, tuple) else value)
+            self._done[id(value)] = (value, self._finished(value, depth + 1))
+        finished = self._done[id(value)][1]
+        if finished is _UNFINISHED:
+            raise ValueError("a tuple holds itself")
+        return finished
+
+    def _finished(self, value: Any, depth: int) -> Any:
+        if isinstance(value, StoredArray):
+            return value.array()
+        if isinstance(value, tuple):
+            return tuple([self.finish(part, depth) for part in value])
+        if isinstance(value, StandIn):
+            self.finish(value.state, depth)
+        elif isinstance(value, dict):
+            for key in value:
+                value[key] = self.finish(value[key], depth)
+        elif isinstance(value, list):
+            value[:] = [self.finish(part, depth) for part in value]
+        elif not isinstance(value, set | frozenset):
+            raise ValueError(f"a {type(value).__name__} is no data")
+        return value
+
+
+_UNFINISHED = object()
+
+
+class _Inert:
+    """A name that a pickle may mention but neither change nor use as anything but what we make of it."""
+
+    __slots__ = ("_build", "_name")
+
+    def __init__(self, name: str, build: Callable[..., Any] | None = None):
+        self._name, self._build = name, build
+
+    def __call__(self, *args: Any) -> Any:
+        if self._build is None:
+            raise ValueError(f"{self._name} may not be called")
+        return self._build(*args)
+
+    def __setstate__(self, state: Any) -> None:
+        refuse_change(self._name)
+
+
+_NDARRAY = _Inert("numpy.ndarray")
+_OBJECT = _Inert("object")
+
+
+def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> StoredArray:
+    """Announce an array that the pickle then fills; only true `ndarray`s."""
+    if subtype is not _NDARRAY:
+        raise ValueError("only plain numpy.ndarray can be rebuilt")
+    if shape != (0,) or dtype not in ("b", b"b"):
+        raise ValueError(
+            "an array must start empty and of bytes, as NumPy writes it: no arrays of Python objects"
+        )
+    return StoredArray()
+
+
+def _scalar(dtype: Any, data: Any = None) -> StoredArray:
+    """Describe a NumPy scalar by its bytes."""
+    return StoredArray().fill((), dtype, "C", data, scalar=True)
+
+
+def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> StoredArray:
+    """Describe an array by a buffer (pickle protocol 5)."""
+    if order not in ("C", "F"):
+        raise ValueError("an array's order must be C or F")
+    return StoredArray().fill(shape, dtype, order, data)
+
+
+def _encode(text: Any, encoding: Any = "latin1") -> bytes:
+    """Bytes as protocol 2 writes them; the only codec in use there is latin-1."""
+    if not isinstance(text, str) or not isinstance(encoding, str):
+        raise ValueError("bytes must be given as text and a codec")
+    if codecs.lookup(encoding).name != "iso8859-1":
+        raise ValueError(f"codec {encoding!r} is not read")
+    return text.encode("latin1")
+
+
+def _set(members: Any = ()) -> set:
+    """Build a set of names, such as chumpy keeps."""
+    if not isinstance(members, list | tuple):
+        raise ValueError(f"a set must be given its members in a list; got a {type(members).__name__}")
+    _check_keys(members)
+    return set(members)
+
+
+def _new_stand_in(kind: Any, base: Any, state: Any) -> StandIn:
+    """What protocols 0 and 1 call to make an object: here only a stand-in."""
+    if not (isinstance(kind, type) and issubclass(kind, StandIn) and base is _OBJECT and state is None):
+        raise ValueError("only stand-ins for known array classes can be rebuilt")
+    return kind()
+
+
+def _text(key: Any) -> str:
+    return key.decode("latin1") if isinstance(key, bytes) else str(key)
+
+
+_ALLOWED: dict[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): _NDARRAY,
+    ("numpy", "dtype"): _Inert("numpy.dtype", StoredDtype),
+    ("_codecs", "encode"): _Inert("_codecs.encode", _encode),
+    **{(f"{core}.multiarray", "_reconstruct"): _Inert("_reconstruct", _reconstruct) for core in _NUMPY_CORE},
+    **{(f"{core}.multiarray", "scalar"): _Inert("scalar", _scalar) for core in _NUMPY_CORE},
+    **{(f"{core}.numeric", "_frombuffer"): _Inert("_frombuffer", _from_buffer) for core in _NUMPY_CORE},
+    **{(name, "_reconstructor"): _Inert("_reconstructor", _new_stand_in) for name in ("copyreg", "copy_reg")},
+    **{(name, "object"): _OBJECT for name in _BUILTINS},
+    **{(name, "set"): _Inert("set", _set) for name in _BUILTINS},
+}

@@ -1,0 +1,137 @@
+"""What a pickle says of arrays, kept inert and checked before NumPy sees any of it.
+
+`np.dtype` and `np.ndarray` trust the state that a pickle gives them: a forged one makes NumPy read bytes as
+pointers. The classes here take the same calls, accept only the few forms that NumPy writes for plain numbers,
+and make the array from bytes whose count was checked.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+_CODES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+_ORDERS = ("<", ">", "|")
+_MOST_DIMENSIONS = 32
+_LARGEST_BYTES = 2**40
+
+
+def refuse_change(name: str) -> None:
+    """Answer a pickle that wants to set the state of something fixed.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError(f"{name} may not be changed")
+
+
+class StoredDtype:
+    """A type of plain numbers: a code such as "f8", and a byte order set once."""
+
+    __slots__ = ("_code", "_order")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, code: Any, align: Any = False, copy: Any = True):
+        """Take the arguments that `numpy.dtype` gives to its own pickles.
+
+        Raises:
+            ValueError: a code of anything but plain numbers.
+        """
+        if _latin1(code) not in _CODES or not all(type(flag) in (bool, int) for flag in (align, copy)):
+            raise ValueError(
+                f"dtype {_shown(code)} is refused: only plain numbers ({', '.join(_CODES)}) are read, "
+                "no arrays of Python objects, text or records"
+            )
+        self._code, self._order = _latin1(code), None
+
+    def __setstate__(self, state: Any) -> None:
+        """Take (3, order, None, None, None, -1, -1, 0), as NumPy writes it for numbers, and nothing else."""
+        if self._order is not None:
+            refuse_change("a finished dtype")
+        plain = isinstance(state, tuple) and len(state) == 8
+        if not plain or _latin1(state[1]) not in _ORDERS or not _is_plain_state(state):
+            raise ValueError(f"the state of dtype {self._code!r} is not one that NumPy writes for numbers")
+        self._order = _latin1(state[1])
+
+    def numpy(self) -> np.dtype:
+        """Make the true dtype."""
+        return np.dtype(self._code).newbyteorder(self._order or "=")
+
+
+class StoredArray:
+    """An array or scalar that a pickle describes: first empty, then filled once."""
+
+    __slots__ = ("_dtype", "_order", "_raw", "_scalar", "_shape")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        """Start empty: `fill` or `__setstate__` follows."""
+        self._raw: bytes | None = None
+
+    def fill(self, shape: Any, dtype: Any, order: str, data: Any, scalar: bool = False) -> "StoredArray":
+        """Take the contents; return self.
+
+        Raises:
+            ValueError: already filled; not plain numbers; a shape or a byte count that do not fit.
+        """
+        if self._raw is not None:
+            refuse_change("a finished array")
+        if not isinstance(dtype, StoredDtype):
+            raise ValueError(f"an array's type must be a dtype of numbers; got a {type(dtype).__name__}")
+        if isinstance(data, str):
+            data = data.encode("latin1")
+        if not isinstance(data, bytes):
+            raise ValueError(f"an array must come as bytes, not as a {type(data).__name__}")
+        self._dtype, self._order, self._scalar = dtype.numpy(), order, scalar
+        self._shape = _checked_shape(shape, self._dtype.itemsize, len(data))
+        self._raw = data
+        return self
+
+    def __setstate__(self, state: Any) -> None:
+        """Take (version, shape, dtype, Fortran order, bytes), or the same without version."""
+        if not isinstance(state, tuple) or len(state) not in (4, 5) or state[:-4] not in ((), (1,)):
+            raise ValueError("the state of an array is not one that NumPy writes")
+        shape, dtype, is_fortran, data = state[-4:]
+        if type(is_fortran) not in (bool, int):
+            raise ValueError("the state of an array is not one that NumPy writes")
+        self.fill(shape, dtype, "F" if is_fortran else "C", data)
+
+    def array(self) -> Any:
+        """Make the true array (a copy, writable) or scalar.
+
+        Raises:
+            ValueError: the pickle never gave its contents.
+        """
+        if self._raw is None:
+            raise ValueError("an array was announced but never given")
+        flat = np.frombuffer(self._raw, dtype=self._dtype)
+        if self._scalar:
+            return flat[0]
+        return flat.reshape(self._shape, order=self._order).copy(order="K")  # type: ignore[call-overload]
+
+
+def _is_plain_state(state: tuple) -> bool:
+    expected = (3, None, None, None, -1, -1, 0)
+    got = (state[0], *state[2:])
+    return all(type(a) is type(b) and a == b for a, b in zip(got, expected, strict=True))
+
+
+def _checked_shape(shape: Any, itemsize: int, num_bytes: int) -> tuple[int, ...]:
+    whole = isinstance(shape, tuple) and len(shape) <= _MOST_DIMENSIONS
+    if not whole or not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError("an array's shape must be a tuple of sizes")
+    if math.prod(max(n, 1) for n in shape) * itemsize > _LARGEST_BYTES:
+        raise ValueError("an array's shape is beyond any file's size")
+    expected = math.prod(shape) * itemsize
+    if expected != num_bytes:
+        raise ValueError(f"an array of shape {shape} needs {expected} bytes; got {num_bytes}")
+    return shape
+
+
+def _latin1(text: Any) -> Any:
+    return text.decode("latin1") if isinstance(text, bytes) else text if isinstance(text, str) else None
+
+
+def _shown(value: Any) -> str:
+    """Show text in short; of anything else only its type, for its contents may be endless."""
+    return repr(value[:20]) if isinstance(value, str | bytes) else f"of a {type(value).__name__}"

@@ -1,0 +1,333 @@
+"""Training losses of multi-view hand reconstruction, and the recipes that weigh them.
+
+All points are metres, all pixels belong to the crops as fed, and D is the diagonal of a crop in pixels.
+Every mean runs over what exists: padded views (`view_mask`), padded samples (`sample_mask`) and samples that
+could not be solved (`Prediction.valid`) change neither a loss nor a gradient.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from poem_jax.batch import MultiViewBatch, Prediction
+from poem_jax.geometry.cameras import Cameras, anchor_to_primary, fill_masked_views, project
+from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.hand.model import HandModel, joints_from_vertices
+from poem_jax.hand.topology import ROOT_JOINT, split_joints_first, split_vertices_first
+from poem_jax.typing import Array, Bool, Float
+
+
+class Penalty(Enum):
+    """How a coordinate's residual is punished."""
+
+    SQUARED = "squared"
+    ABSOLUTE = "absolute"
+
+
+class Layers(Enum):
+    """Which decoder layers are supervised; the terms of several layers are summed."""
+
+    LAST = "last"
+    EVERY = "every"
+
+
+class PoseSpace(Enum):
+    """The space in which two poses are subtracted."""
+
+    AXIS_ANGLE = "axis_angle"
+    ROTATION = "rotation"
+
+
+class QueryOrder(Enum):
+    """The layout of the 799 query points in `Prediction.layers_world`."""
+
+    VERTICES_FIRST = "vertices_first"
+    JOINTS_FIRST = "joints_first"
+
+
+@dataclass(frozen=True)
+class LossRecipe:
+    """Weights and forms of the terms of `multi_view_losses`; the defaults are the release's."""
+
+    name: str
+    layers: Layers = Layers.LAST
+    keypoints: float = 10.0
+    """Heat-map coordinates against the projected joints, in diagonals."""
+    keypoint_penalty: Penalty = Penalty.SQUARED
+    heat_maps: float = 0.0
+    """Cross-entropy of the heat maps and a Gaussian about the true key point; neither paper nor release has
+    it. It tells every cell what to do, where the coordinates' loss tells only their mean."""
+    heat_map_sigma: float = 0.75
+    """Spread of that Gaussian, in cells."""
+    joints: float = 1.0
+    regressed_joints: float = 1.0
+    """Joints regressed from the vertices."""
+    joint_penalty: Penalty = Penalty.SQUARED
+    vertices: float = 1.0
+    """Always an L1 loss."""
+    reprojection: float = 1.0
+    """Projected joints, in diagonals, clamped to half a diagonal per coordinate."""
+    reprojection_penalty: Penalty = Penalty.SQUARED
+    pose: float = 0.001
+    pose_space: PoseSpace = PoseSpace.AXIS_ANGLE
+    shape: float = 0.0005
+    point_unit_m: float = 1.0
+    """The length that counts as 1 in the three point terms."""
+
+
+RELEASE = LossRecipe("release")
+"""The released training code: the last layer only (FACTS section 10)."""
+
+PAPER = LossRecipe("paper", layers=Layers.EVERY, pose_space=PoseSpace.ROTATION)
+"""The release's weights on every layer, summed; poses are compared as rotations, since axis-angle wraps."""
+
+SYNTHETIC = LossRecipe(
+    "synthetic",
+    layers=Layers.EVERY,
+    keypoints=10.0,
+    keypoint_penalty=Penalty.ABSOLUTE,
+    heat_maps=1.0,
+    joint_penalty=Penalty.ABSOLUTE,
+    reprojection=0.0,
+    point_unit_m=0.1,
+)
+"""For short runs: absolute errors, points in units of 10 cm; the 2D term does not fade as it shrinks."""
+
+RECIPES = {recipe.name: recipe for recipe in (RELEASE, PAPER, SYNTHETIC)}
+
+
+_HEAT_FLOOR = 1e-8
+"""Added to the heat before its logarithm."""
+
+
+class _Points(NamedTuple):
+    """What the model says about one decoder layer, in the world frame."""
+
+    joints: Float[Array, "batch 21 3"]
+    vertices: Float[Array, "batch 778 3"]
+
+
+def masked_mean(
+    values: Float[Array, "..."], mask: Bool[Array, "..."], *, axis_name: str | None = None
+) -> Float[Array, ""]:
+    """Average the entries whose mask is True.
+
+    Args:
+        values: any numbers; masked entries may hold anything, NaN included.
+        mask: shape of the leading axes of `values`; True = counts.
+        axis_name: mapped axis over which the batch is split. The result is then this shard's share of the
+            global mean: `jax.lax.psum` of the shares is that mean, however many entries each shard has.
+
+    Returns:
+        The mean, or 0 where nothing is valid.
+    """
+    full_mask = jnp.broadcast_to(mask.reshape(mask.shape + (1,) * (values.ndim - mask.ndim)), values.shape)
+    count = full_mask.sum(dtype=values.dtype)
+    if axis_name is not None:
+        count = jax.lax.psum(count, axis_name)
+    return jnp.where(full_mask, values, 0.0).sum() / jnp.maximum(count, 1.0)
+
+
+def multi_view_losses(
+    prediction: Prediction,
+    batch: MultiViewBatch,
+    *,
+    hand: HandModel,
+    image_hw: tuple[int, int],
+    recipe: LossRecipe,
+    query_order: QueryOrder = QueryOrder.VERTICES_FIRST,
+    axis_name: str | None = None,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Compute the weighted training loss and its unweighted terms.
+
+    The terms are the release's (FACTS section 10): `keypoints`, `joints`, `regressed_joints`, `vertices`,
+    `reprojection`, and for parametric predictions `pose` and `shape`. L1 terms are taken in the primary
+    camera's frame, so that no choice of the world frame changes the loss.
+
+    Args:
+        prediction: the model's output; `keypoints_px` holds the root joint only, or all 21.
+        batch: ground truth in the same world frame; `view_mask` and `sample_mask` say what counts.
+        hand: gives the regressor of the joints from the vertices.
+        image_hw: height and width of the crops as fed.
+        recipe: weights and forms; static.
+        query_order: layout of `prediction.layers_world`.
+        axis_name: as in `masked_mean`; losses and terms are then shares whose `psum` is the global value.
+
+    Returns:
+        The loss, and the terms by name (of the last layer; point terms in `recipe.point_unit_m`).
+    """
+    view_mask, sample_mask = valid_masks(prediction, batch)
+    diagonal = _diagonal(image_hw)
+    cameras = fill_masked_views(Cameras(batch.cameras.K, batch.cameras.T_cam_from_world, view_mask))
+    truth = _Points(batch.joints_world, batch.vertices_world)
+
+    terms_2d = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=recipe, axis_name=axis_name)
+
+    compare = partial(
+        _point_terms,
+        truth=truth,
+        keypoints_px=batch.keypoints_px,
+        cameras=cameras,
+        sample_mask=sample_mask,
+        hand=hand,
+        diagonal=diagonal,
+        recipe=recipe,
+        axis_name=axis_name,
+    )
+    layer_terms = [compare(points) for points in _supervised(prediction, recipe.layers, query_order)]
+    terms = {
+        **terms_2d,
+        **layer_terms[-1],
+        **_parametric_terms(prediction, batch, sample_mask, recipe.pose_space, axis_name),
+    }
+    loss = weighted(terms_2d, recipe)
+    for term in layer_terms:
+        loss += weighted(term, recipe)
+    loss += weighted({name: terms[name] for name in ("pose", "shape") if name in terms}, recipe)
+    return loss, terms
+
+
+def keypoint_terms(
+    prediction: Prediction,
+    batch: MultiViewBatch,
+    *,
+    image_hw: tuple[int, int],
+    recipe: LossRecipe,
+    axis_name: str | None = None,
+) -> dict[str, Float[Array, ""]]:
+    """Compute the terms of the first stage, `keypoints` and, where the recipe weighs it, `heat_maps`.
+
+    Arguments and masks as in `multi_view_losses`.
+    """
+    view_mask, _ = valid_masks(prediction, batch)
+    truth_px = match_keypoints(prediction, batch)
+    residual = (prediction.keypoints_px - truth_px) / _diagonal(image_hw)
+    terms = {"keypoints": _mean_of_norms(residual, view_mask, recipe.keypoint_penalty, axis_name)}
+    if recipe.heat_maps and prediction.heat_maps is not None:
+        cells = truth_px * (prediction.heat_maps.shape[-1] / image_hw[1])
+        entropy = _cross_entropy(prediction.heat_maps, cells, recipe.heat_map_sigma)
+        terms["heat_maps"] = masked_mean(entropy, view_mask, axis_name=axis_name)
+    return terms
+
+
+def weighted(terms: dict[str, Array], recipe: LossRecipe) -> Array:
+    """Sum the terms, each times the recipe's weight of its name."""
+    return sum((getattr(recipe, name) * value for name, value in terms.items()), jnp.zeros(()))
+
+
+def _cross_entropy(
+    heat_maps: Float[Array, "*batch h w"], cells: Float[Array, "*batch 2"], sigma: float
+) -> Float[Array, "*batch"]:
+    """Compare maps that sum to 1 with Gaussians about `cells`; zero where those lie outside the map."""
+
+    def profile(center: Array, size: int) -> Array:
+        return jnp.exp(-0.5 * ((jnp.arange(size) + 0.5 - center[..., None]) / sigma) ** 2)
+
+    h, w = heat_maps.shape[-2:]
+    target = profile(cells[..., 1], h)[..., :, None] * profile(cells[..., 0], w)[..., None, :]
+    target = target / (jnp.sum(target, (-2, -1), keepdims=True) + 1e-6)
+    return -jnp.sum(target * jnp.log(heat_maps + _HEAT_FLOOR), (-2, -1))
+
+
+def valid_masks(
+    prediction: Prediction, batch: MultiViewBatch
+) -> tuple[Bool[Array, "batch view"], Bool[Array, " batch"]]:
+    """Return the views whose 2D terms count and the samples whose 3D terms count."""
+    sample_mask = jnp.any(jnp.asarray(batch.cameras.view_mask), axis=-1)
+    if batch.sample_mask is not None:
+        sample_mask = sample_mask & batch.sample_mask
+    view_mask = batch.cameras.view_mask & sample_mask[:, None]
+    return view_mask, sample_mask & prediction.valid
+
+
+def match_keypoints(prediction: Prediction, batch: MultiViewBatch) -> Float[Array, "batch view joint 2"]:
+    """Return the true key points that belong to the predicted ones: the root joint, or all 21."""
+    if prediction.keypoints_px.shape[-2] == 1:
+        return batch.keypoints_px[..., ROOT_JOINT : ROOT_JOINT + 1, :]
+    return batch.keypoints_px
+
+
+def split_queries(points: Float[Array, "*batch 799 3"], query_order: QueryOrder) -> tuple[Array, Array]:
+    """Split query points into (vertices, joints)."""
+    if query_order is QueryOrder.VERTICES_FIRST:
+        return split_vertices_first(points)
+    return split_joints_first(points)
+
+
+def _supervised(prediction: Prediction, layers: Layers, query_order: QueryOrder) -> list[_Points]:
+    """List the supervised layers, the last one last: it is the prediction itself."""
+    last = _Points(prediction.joints_world, prediction.vertices_world)
+    if layers is Layers.LAST:
+        return [last]
+    vertices, joints = split_queries(prediction.layers_world[:-1], query_order)
+    return [_Points(joints[i], vertices[i]) for i in range(vertices.shape[0])] + [last]
+
+
+def _point_terms(
+    points: _Points,
+    *,
+    truth: _Points,
+    keypoints_px: Array,
+    cameras: Cameras,
+    sample_mask: Array,
+    hand: HandModel,
+    diagonal: float,
+    recipe: LossRecipe,
+    axis_name: str | None,
+) -> dict[str, Array]:
+    """Compute the four terms of one decoder layer."""
+    _, T_primary_from_world = anchor_to_primary(cameras.T_cam_from_world, cameras.view_mask)
+    rotation = T_primary_from_world[..., :3, :3]
+
+    def difference(a_world: Array, b_world: Array) -> Array:
+        return jnp.einsum("bij,bnj->bni", rotation, a_world - b_world) / recipe.point_unit_m
+
+    def mean(residual: Array, penalty: Penalty) -> Array:
+        return masked_mean(_punish(residual, penalty), sample_mask, axis_name=axis_name)
+
+    regressed = joints_from_vertices(hand, points.vertices)
+    regressed_truth = joints_from_vertices(hand, truth.vertices)
+    view_mask = cameras.view_mask & sample_mask[:, None]
+    uv_px, _ = project(cameras.K, cameras.T_cam_from_world, points.joints[:, None])
+    residual_px = jnp.clip(uv_px - keypoints_px, -diagonal / 2, diagonal / 2)
+    return {
+        "joints": mean(difference(points.joints, truth.joints), recipe.joint_penalty),
+        "regressed_joints": mean(difference(regressed, regressed_truth), recipe.joint_penalty),
+        "vertices": mean(difference(points.vertices, truth.vertices), Penalty.ABSOLUTE),
+        "reprojection": _mean_of_norms(
+            residual_px / diagonal, view_mask, recipe.reprojection_penalty, axis_name
+        ),
+    }
+
+
+def _parametric_terms(
+    prediction: Prediction, batch: MultiViewBatch, sample_mask: Array, space: PoseSpace, axis_name: str | None
+) -> dict[str, Array]:
+    """Compare pose and shape where both sides have them."""
+    terms = {}
+    if prediction.pose is not None and batch.pose is not None:
+        pose, truth = prediction.pose, jnp.asarray(batch.pose)
+        if space is PoseSpace.ROTATION:
+            pose, truth = rotation_from_axis_angle(pose), rotation_from_axis_angle(truth)
+        terms["pose"] = masked_mean((pose - truth) ** 2, sample_mask, axis_name=axis_name)
+    if prediction.shape is not None and batch.shape is not None:
+        residual = prediction.shape - batch.shape
+        terms["shape"] = masked_mean(residual**2, sample_mask, axis_name=axis_name)
+    return terms
+
+
+def _diagonal(image_hw: tuple[int, int]) -> float:
+    return float(image_hw[0] ** 2 + image_hw[1] ** 2) ** 0.5
+
+
+def _punish(residual: Array, penalty: Penalty) -> Array:
+    return residual**2 if penalty is Penalty.SQUARED else jnp.abs(residual)
+
+
+def _mean_of_norms(residual: Array, mask: Array, penalty: Penalty, axis_name: str | None) -> Array:
+    """Average over points the penalties summed over u and v."""
+    return masked_mean(_punish(residual, penalty).sum(-1), mask, axis_name=axis_name)

@@ -1,0 +1,1 @@
+"""The networks: backbones, root stage, aggregation, decoder, presets."""

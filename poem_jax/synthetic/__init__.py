@@ -1,0 +1,1 @@
+"""Endless synthetic multi-view captures with exact ground truth."""

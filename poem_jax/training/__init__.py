@@ -1,0 +1,1 @@
+"""State, pure step, loop, checkpoints."""

@@ -1,0 +1,349 @@
+"""What an experiment is: frozen dataclasses nested by owner, written as plain Python in `configs/`.
+
+Importing this module starts no JAX backend, so that an entry point can still choose the devices.
+"""
+
+import dataclasses
+import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from poem_jax.losses import PAPER, LossRecipe
+from poem_jax.models.config import Config
+from poem_jax.synthetic.config import SyntheticConfig
+
+
+class Schedule(Enum):
+    """How the learning rate goes down after the warm-up."""
+
+    CONSTANT = "constant"
+    COSINE = "cosine"
+    STEP = "step"
+
+
+class Clip(Enum):
+    """What the gradient norm is taken over before it is limited."""
+
+    NONE = "none"
+    GLOBAL = "global"
+    PER_TENSOR = "per_tensor"
+
+
+class DataParallel(Enum):
+    """How a batch is split over the devices; the result is the same."""
+
+    SHARD_MAP = "shard_map"
+    JIT = "jit"
+
+
+@dataclass(frozen=True)
+class BatchShape:
+    """One kind of batch. Every kind compiles its own program."""
+
+    num_views: int = 4
+    """Padded number of views."""
+    batch_size: int = 16
+    min_views: int | None = None
+    """Samples have from this many to `num_views` views, uniformly; None = always `num_views`."""
+    weight: float = 1.0
+    """How often this kind is drawn, relative to the others."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= (self.min_views or 1) <= self.num_views:
+            raise ValueError(f"`min_views` must lie in 1..num_views = {self.num_views}; got {self.min_views}")
+        if self.batch_size < 1 or self.weight < 0:
+            raise ValueError(f"`batch_size` must be >= 1 and `weight` >= 0; got {self}")
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Where the training samples come from."""
+
+    synthetic: SyntheticConfig = field(default_factory=SyntheticConfig)
+    seed: int = 1
+    """Seed of the training samples; evaluation uses others."""
+    batches: tuple[BatchShape, ...] = (BatchShape(),)
+    prefetch: int = 3
+    """Batches drawn ahead in the background."""
+    workers: int = 1
+    """Threads that draw them."""
+
+    def __post_init__(self) -> None:
+        if not self.batches or sum(shape.weight for shape in self.batches) <= 0:
+            raise ValueError(
+                f"`data.batches` needs at least one shape with positive weight; got {self.batches}"
+            )
+
+
+class RootSource(Enum):
+    """The point about which the second stage works in training."""
+
+    TRUTH = "truth"
+    """The true root joint, with noise (paper and release)."""
+    TRIANGULATED = "triangulated"
+    """The first stage's own where two views or more see the hand, as at inference; else the noisy truth."""
+
+
+@dataclass(frozen=True)
+class TrainingRoot:
+    """The root joint about which the second stage works in training, and its noise in metres."""
+
+    source: RootSource = RootSource.TRUTH
+    per_coordinate_m: float = 0.01
+    """Standard deviation per sample and coordinate."""
+    shared_m: float = 0.0
+    """Standard deviation of one number added to all coordinates of the batch (the release: 0.01)."""
+    scale: float = 0.0
+    """Largest relative scaling about the noisy wrist, one number per batch (the release: 0.01)."""
+
+
+PAPER_ROOT = TrainingRoot()
+"""Gaussian noise of 1 cm per sample and coordinate."""
+RELEASE_ROOT = TrainingRoot(per_coordinate_m=0.01, shared_m=0.01, scale=0.01)
+"""The released training code (FACTS section 3)."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam, its learning-rate schedule, gradient clipping, and the moving average of the weights."""
+
+    learning_rate: float = 1e-4
+    first_stage_learning_rate: float | None = None
+    """Highest rate of the steps that train the heat maps alone; None = the same."""
+    b1: float = 0.9
+    b2: float = 0.999
+    eps: float = 1e-8
+    weight_decay: float = 0.0
+    schedule: Schedule = Schedule.COSINE
+    warmup_steps: int = 0
+    decay_steps: int | None = None
+    """Steps (warm-up included) until the rate has reached its last value; None = the whole run."""
+    final_ratio: float = 0.001
+    """Last learning rate over the highest one."""
+    drop_at: float = 0.7
+    """Part of the run after which `Schedule.STEP` multiplies the rate by 0.1."""
+    clip: Clip = Clip.GLOBAL
+    clip_norm: float = 1.0
+    ema_decay: float = 0.0
+    """Decay per step of the moving average of weights and statistics; 0 = none."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Length, place and bookkeeping of a run."""
+
+    steps: int = 1000
+    seed: int = 0
+    out: str = "runs/experiment"
+    init_from: str | None = None
+    """Folder of a model (`poem_jax.save`, `--export`) that a fresh run starts from; None = random weights."""
+    max_minutes: float | None = None
+    """Stop after this time, with a checkpoint; the same command goes on from there."""
+    log_every: int = 20
+    checkpoint_every: int = 500
+    keep_checkpoints: int = 2
+    validate_every: int = 0
+    """Steps between validations on held-out samples; 0 = never."""
+    validation_samples: int = 32
+    validation_views: tuple[int, ...] = (2, 4, 8)
+    validation_seed: int = 424242
+    host_devices: int = 1
+    """CPU devices the entry point asks for; without effect on accelerators."""
+    data_parallel: DataParallel = DataParallel.SHARD_MAP
+    tensorboard: bool = False
+    progress: bool = True
+    allow_config_change: bool = False
+    """Go on from a checkpoint although the config differs from the one it was made with."""
+    require_clean_commit: bool = False
+    """Refuse to start while the working tree has uncommitted changes."""
+
+    def __post_init__(self) -> None:
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"`train.{name}` must be at least {least}; got {getattr(self, name)}")
+        if self.max_minutes is not None and not self.max_minutes > 0:
+            raise ValueError(f"`train.max_minutes` must be positive, or None; got {self.max_minutes}")
+        if not self.validation_views or min(self.validation_views) < 1:
+            raise ValueError(
+                f"`train.validation_views` must name view counts from 1; got {self.validation_views}"
+            )
+
+
+_LEAST = {
+    "steps": 0,
+    "log_every": 1,
+    "checkpoint_every": 1,
+    "keep_checkpoints": 1,
+    "validate_every": 0,
+    "validation_samples": 1,
+    "host_devices": 1,
+}
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A whole experiment."""
+
+    name: str
+    model: Config
+    data: DataConfig = DataConfig()
+    loss: LossRecipe = PAPER
+    first_stage_steps: int = 0
+    """Steps at the beginning that train trunk and heat maps alone, for less than half the cost of a whole
+    step: the second stage then starts from joints that mean something. Adam's moments start anew after."""
+    training_root: TrainingRoot = PAPER_ROOT
+    optimizer: OptimizerConfig = OptimizerConfig()
+    train: RunConfig = RunConfig()
+
+    def __post_init__(self) -> None:
+        devices = self.train.host_devices
+        sizes = [shape.batch_size for shape in self.data.batches]
+        if any(size % devices for size in sizes):
+            raise ValueError(
+                f"every `batch_size` must be a multiple of `train.host_devices` = {devices}; got {sizes}"
+            )
+        data = self.data.synthetic
+        if tuple(data.image_hw) != tuple(self.model.image_hw):
+            raise ValueError(
+                f"`data.synthetic.image_hw` must be the model's {self.model.image_hw}; got {data.image_hw}"
+            )
+        most = max(shape.num_views for shape in self.data.batches)
+        if most > data.num_views:
+            raise ValueError(
+                f"`data.batches` asks for {most} views, but `data.synthetic.num_views` is {data.num_views}"
+            )
+        if self.train.validate_every and max(self.train.validation_views) > data.num_views:
+            raise ValueError(
+                f"`train.validation_views` must not exceed `data.synthetic.num_views` = {data.num_views}; "
+                f"got {self.train.validation_views}"
+            )
+
+
+BOOKKEEPING = (
+    "train.steps",
+    "train.out",
+    "train.max_minutes",
+    "train.log_every",
+    "train.checkpoint_every",
+    "train.keep_checkpoints",
+    "train.validate_every",
+    "train.validation_samples",
+    "train.validation_views",
+    "train.validation_seed",
+    "train.host_devices",
+    "train.data_parallel",
+    "train.tensorboard",
+    "train.progress",
+    "train.allow_config_change",
+    "train.require_clean_commit",
+    "data.prefetch",
+    "data.workers",
+)
+"""Fields that may change between two sittings of one run: they do not touch what is learned."""
+
+
+def load_experiment(path: str | Path, name: str = "config") -> Any:
+    """Run a Python file and return its variable `name`.
+
+    A file in a folder called `configs` may import its neighbours as `configs.<name>`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file does not define `name`.
+    """
+    path = Path(path).resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"experiment file not found: {path}")
+    root = str(path.parent.parent)
+    if path.parent.name == "configs" and root not in sys.path:
+        sys.path.insert(0, root)
+    spec = importlib.util.spec_from_file_location(f"experiment_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not hasattr(module, name):
+        raise ValueError(f"{path} must define `{name}`; it defines {sorted(public_names(module))}")
+    return getattr(module, name)
+
+
+def public_names(module: Any) -> set[str]:
+    """Return the names of a module that do not start with an underscore."""
+    return {key for key in vars(module) if not key.startswith("_")}
+
+
+def override(config: TrainConfig, arguments: Sequence[str]) -> TrainConfig:
+    """Apply command-line overrides such as `--train.max-minutes 30`; unknown names end the program."""
+    import tyro
+
+    return tyro.cli(
+        TrainConfig,
+        default=config,
+        args=list(arguments),
+        prog="train.py CONFIG",
+        config=(tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues),
+    )
+
+
+def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
+    """List every field of nested dataclasses by its dotted name, with JSON values."""
+    if dataclasses.is_dataclass(config):
+        items = [(f.name, getattr(config, f.name)) for f in dataclasses.fields(config)]
+    elif isinstance(config, tuple | list):
+        items = [(str(i), value) for i, value in enumerate(config)]
+    elif isinstance(config, dict):
+        items = [(str(key), value) for key, value in config.items()]
+    else:
+        return {prefix: config.value if isinstance(config, Enum) else config}
+    flat: dict[str, Any] = {} if items else {prefix: []}
+    for name, value in items:
+        flat |= flatten_config(value, f"{prefix}.{name}" if prefix else name)
+    return flat
+
+
+def config_json(config: TrainConfig) -> str:
+    """Write the resolved config as JSON: dotted names and values, one a line."""
+    return json.dumps(flatten_config(config), indent=1)
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Describe the fields in which two flattened configs differ, bookkeeping aside."""
+    ours, theirs = _learned(new), _learned(old)
+    missing = "absent"
+    return [
+        f"{key}: {theirs.get(key, missing)} -> {ours.get(key, missing)}"
+        for key in sorted(ours.keys() | theirs.keys())
+        if theirs.get(key, missing) != ours.get(key, missing)
+    ]
+
+
+def _learned(flat: dict[str, Any]) -> dict[str, Any]:
+    """Keep the fields that decide what is learned: the length of a run only where its schedule spans it."""
+    kept = {key: value for key, value in flat.items() if not key.startswith(BOOKKEEPING)}
+    kept["optimizer.decay_steps"] = flat.get("optimizer.decay_steps") or flat.get("train.steps")
+    return kept
+
+
+def git_commit(file: str | Path = __file__) -> str:
+    """Return the commit of the checkout that `file` of this package comes from, with `+changes` if tracked
+    files differ from it; `unknown` without git, or where the package is installed and not checked out."""
+    file = Path(file).resolve()
+    try:
+        _git(file.parent, "ls-files", "--error-unmatch", file.name)
+        commit = _git(file.parent, "rev-parse", "HEAD")
+        return commit + ("+changes" if _git(file.parent, "status", "--porcelain", "-uno") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    result = subprocess.run(
+        ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True
+    )
+    return result.stdout.strip()

@@ -1,0 +1,230 @@
+"""Weights on disk: a folder with `config.json` and `ckpt/`, an Orbax checkpoint of the parameters.
+
+The config travels with the weights, so that a checkpoint loads without its experiment file. Writing goes to a
+temporary folder beside the target, which is renamed when it is whole.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from orbax.checkpoint import v1 as ocp
+
+from poem_jax.models.config import Config, from_json, to_json
+from poem_jax.models.parameters import describe
+from poem_jax.typing import Array, Params, PyTree
+
+CONFIG_FILE = "config.json"
+ARRAYS_FOLDER = "ckpt"
+SHIPPED = Path(__file__).parent / "tiny"
+"""The weights that come with the package."""
+
+
+def save(
+    path: str | os.PathLike, config: Config, params: Params, *, dtype: Any = None, overwrite: bool = False
+) -> None:
+    """Write a model: its config as JSON and its parameters as an Orbax checkpoint.
+
+    Args:
+        path: folder to make; on failure nothing is left there, and what stood there stays.
+        config: the model.
+        params: its parameters; must fit `config`.
+        dtype: storage type of weights and statistics (for example `jnp.float16`, to ship half the bytes);
+            constants and integers keep theirs. None = as they are.
+        overwrite: replace what stands at `path`.
+
+    Raises:
+        ValueError: `params` do not fit `config` or the storage type or hold NaN or infinity, or `path`
+            exists and is a file, or `overwrite` is False.
+    """
+    path = Path(path).resolve()
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"`path` must name a folder; got the file {path}. Give another name")
+    if path.exists() and not overwrite:
+        raise ValueError(f"`path` must not exist yet; got {path}. Pass overwrite=True to replace it")
+    leaves = flatten(params)
+    check_leaves(leaves, expected_leaves(config), f"parameters to save at {path}")
+    _check_finite(leaves, f"parameters to save at {path}")
+    stored = {name: _narrowed(name, np.asarray(leaf), dtype) for name, leaf in leaves.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        (temporary / CONFIG_FILE).write_text(to_json(config) + "\n", encoding="utf-8")
+        ocp.save(str((temporary / ARRAYS_FOLDER).resolve()), stored)
+        temporary.chmod(0o755)
+        _put_in_place(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _put_in_place(new: Path, path: Path) -> None:
+    """Rename `new` to `path`; what stood there goes only when the new one stands."""
+    if not path.exists():
+        os.replace(new, path)
+        return
+    old = new.with_name(new.name + ".old")
+    os.replace(path, old)
+    try:
+        os.replace(new, path)
+    except BaseException:
+        os.replace(old, path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load(path: str | os.PathLike, *, expected: Config | None = None) -> tuple[Config, Params]:
+    """Read a model that `save` wrote.
+
+    Args:
+        path: its folder.
+        expected: the config that the caller needs; None = any.
+
+    Returns:
+        The config, and the parameters as float32 (integers and masks as stored).
+
+    Raises:
+        FileNotFoundError: no such folder, or it misses its config or its arrays.
+        ValueError: unreadable or truncated files, arrays that do not fit the config or hold NaN or infinity,
+            or another config than `expected`.
+    """
+    path = Path(path)
+    config = _read_config(path)
+    if expected is not None and expected != config:
+        raise ValueError(
+            f"checkpoint of another config at {path}: {_config_difference(expected, config)}. "
+            "Build the model from the config that `load` returns, or load the checkpoint of this config"
+        )
+    stored = _read_arrays(path / ARRAYS_FOLDER)
+    template = expected_leaves(config)
+    check_leaves(stored, template, f"checkpoint at {path}")
+    _check_finite(stored, f"checkpoint at {path}")
+    return config, unflatten(
+        {name: jnp.asarray(stored[name], template[name].dtype) for name in template}, _abstract(config)
+    )
+
+
+def shipped() -> tuple[Config, Params]:
+    """Load the weights that come with the package (preset `tiny`, trained on synthetic captures)."""
+    return load(SHIPPED)
+
+
+def flatten(tree: PyTree) -> dict[str, Array]:
+    """List the leaves of a pytree by dotted path."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def unflatten(leaves: dict[str, Array], like: PyTree) -> PyTree:
+    """Put leaves back into a pytree of the structure of `like`."""
+    return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in flatten(like)])
+
+
+def expected_leaves(config: Config) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return shape and dtype of every parameter of a model, without computing any."""
+    return flatten(_abstract(config))
+
+
+def check_leaves(stored: dict[str, Any], template: dict[str, Any], what: str) -> None:
+    """Compare names, shapes and kinds of numbers (not their widths), and report all differences at once.
+
+    Raises:
+        ValueError: something is missing, unknown, of another shape or of another kind.
+    """
+    problems = [
+        f"{name}: missing, expected {template[name].shape}" for name in template.keys() - stored.keys()
+    ]
+    problems += [f"{name}: unknown, got {np.shape(stored[name])}" for name in stored.keys() - template.keys()]
+    problems += [
+        f"{name}: expected {template[name].shape}, got {np.shape(stored[name])}"
+        for name in template.keys() & stored.keys()
+        if tuple(template[name].shape) != tuple(np.shape(stored[name]))
+    ]
+    problems += [
+        f"{name}: expected {_kind(template[name])} numbers, got {_kind(stored[name])}"
+        for name in template.keys() & stored.keys()
+        if _kind(template[name]) != _kind(stored[name])
+    ]
+    if problems:
+        shown = "; ".join(sorted(problems)[:8])
+        raise ValueError(
+            f"{what}: {len(problems)} arrays do not fit the config: {shown}. "
+            "Use the config that the parameters were made with"
+        )
+
+
+def _kind(leaf: Any) -> str:
+    dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
+    kinds = {"floating": jnp.floating, "integer": jnp.integer, "bool": jnp.bool_}
+    return next((name for name, kind in kinds.items() if jnp.issubdtype(dtype, kind)), str(dtype))
+
+
+def _check_finite(leaves: dict[str, Any], what: str) -> None:
+    broken = sorted(
+        name
+        for name, leaf in leaves.items()
+        if _kind(leaf) == "floating" and not np.isfinite(np.asarray(leaf)).all()
+    )
+    if broken:
+        raise ValueError(
+            f"{what}: {len(broken)} arrays hold NaN or infinity: {', '.join(broken[:8])}. "
+            "All weights must be finite; take those from before the training failed"
+        )
+
+
+def _abstract(config: Config) -> PyTree:
+    return describe(config)
+
+
+def _narrowed(name: str, leaf: np.ndarray, dtype: Any) -> np.ndarray:
+    narrow = dtype is not None and leaf.dtype == np.float32 and not name.startswith("constants")
+    if not narrow:
+        return leaf
+    limit = float(jnp.finfo(dtype).max)
+    if np.any(np.abs(leaf) > limit):
+        raise ValueError(
+            f"{name}: values up to {np.abs(leaf).max():.3g} do not fit into {jnp.dtype(dtype).name} "
+            f"(largest {limit:.3g}). Store as bfloat16 or float32"
+        )
+    return leaf.astype(dtype)
+
+
+def _read_config(path: Path) -> Config:
+    file = path / CONFIG_FILE
+    for needed in (path, file, path / ARRAYS_FOLDER):
+        if not needed.exists():
+            raise FileNotFoundError(
+                f"no checkpoint at {path}: {needed} does not exist. "
+                "Expected a folder that poem_jax.save wrote, with config.json and ckpt/"
+            )
+    try:
+        return from_json(file.read_text(encoding="utf-8"))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f"{file} is not a model config: {error}. Expected the JSON that poem_jax.save wrote"
+        ) from error
+
+
+def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
+    try:
+        return cast(dict[str, np.ndarray], ocp.load(str(folder.resolve())))
+    except Exception as error:
+        raise ValueError(
+            f"{folder} is truncated or not an Orbax checkpoint ({type(error).__name__}: {str(error)[:200]}). "
+            "Copy the whole folder again, or save it anew"
+        ) from error
+
+
+def _config_difference(expected: Config, got: Config) -> str:
+    ours, theirs = json.loads(to_json(expected)), json.loads(to_json(got))
+    lines = [
+        f"`{key}` expected {ours.get(key)}, got {theirs.get(key)}"
+        for key in ours.keys() | theirs.keys()
+        if ours.get(key) != theirs.get(key)
+    ]
+    return "; ".join(sorted(lines))

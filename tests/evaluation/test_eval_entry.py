@@ -1,0 +1,153 @@
+"""`eval.py` from experiment file to JSON, with a model too small to be good."""
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.models import poem
+from poem_jax.training.config import load_experiment
+from poem_jax.weights.store import save, shipped
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPERIMENT = """
+import dataclasses
+from poem_jax.models.config import BasisConfig, ResNetConfig
+from poem_jax.models.presets import TINY
+from poem_jax.training.config import DataConfig, TrainConfig
+from poem_jax.synthetic.config import SyntheticConfig
+
+model = dataclasses.replace(
+    TINY,
+    image_hw=(32, 32),
+    width=16,
+    backbone=dataclasses.replace(
+        TINY.backbone, blocks=(1, 1, 1, 1), channels=(8, 8, 16, 16), stem_channels=8
+    ),
+    basis=BasisConfig(num_points=64),
+    decoder=dataclasses.replace(TINY.decoder, num_layers=1, num_neighbours=4),
+)
+data = DataConfig(synthetic=SyntheticConfig(image_hw=(32, 32), num_backgrounds=2))
+config = TrainConfig(name="mini", model=model, data=data)
+"""
+
+
+@pytest.fixture(scope="module")
+def entry() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("eval_entry", ROOT / "eval.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory) -> tuple[Path, Path]:
+    """Experiment file and checkpoint."""
+    folder = tmp_path_factory.mktemp("mini")
+    file = folder / "mini.py"
+    file.write_text(EXPERIMENT)
+    config = load_experiment(file).model
+    save(folder / "ckpt", config, poem.init(config, key=jax.random.key(0)))
+    return file, folder / "ckpt"
+
+
+@pytest.fixture(autouse=True)
+def _no_cache_in_the_home_folder(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "xla"))
+
+
+def test_prints_the_tables_and_writes_json_by_view_count(entry, experiment, tmp_path, capsys) -> None:
+    file, checkpoint = experiment
+    path = tmp_path / "r.json"
+    arguments = [str(file), "--checkpoint", str(checkpoint), "--views", "1,2", "--samples", "3"]
+    arguments += ["--batch-size", "2", "--seed", "5", "--json", str(path), "--no-progress"]
+    assert entry.main(arguments) == 0
+    results = json.loads(path.read_text())
+    assert list(results) == ["1", "2"]
+    for scores in results.values():
+        assert {"mpvpe_mm", "median_mpvpe_mm", "mpvpe_true_root_mm", "f_5", "auc_j_20"} <= set(scores)
+        assert scores["samples"] == 3
+    assert results["1"]["root_error_mm"] == pytest.approx(0, abs=1e-3)
+    assert results["1"]["mpvpe_mm"] == results["1"]["mpvpe_true_root_mm"]
+    assert results["1"]["mean_pose_mpvpe_mm"] == results["2"]["mean_pose_mpvpe_mm"]
+    assert np.isfinite(results["2"]["root_error_mm"])
+    printed = capsys.readouterr().out
+    for part in ("MPVPE", "AUC-J@20", "F@15", "mean pose", "3 synthetic captures of seed 5", str(checkpoint)):
+        assert part in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--views", "0"], "`views` must name counts from 1 to 8; got (0,)"),
+        (["--samples", "0"], "`samples` and `batch_size` must be at least 1"),
+        (["--seed", "-1"], "`seed` must not be negative"),
+        (["--checkpoint", "nowhere"], "no checkpoint at nowhere"),
+    ],
+)
+def test_bad_arguments_end_with_a_message(entry, experiment, capsys, arguments, message) -> None:
+    file, checkpoint = experiment
+    assert entry.main([str(file), "--checkpoint", str(checkpoint), *arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_another_config_is_refused(entry, experiment, tmp_path, capsys) -> None:
+    _, checkpoint = experiment
+    other = tmp_path / "other.py"
+    other.write_text(EXPERIMENT.replace("num_points=64", "num_points=32"))
+    assert entry.main([str(other), "--checkpoint", str(checkpoint)]) == 1
+    assert "checkpoint of another config" in capsys.readouterr().err
+
+
+def test_a_missing_experiment_is_named(entry, capsys) -> None:
+    assert entry.main(["configs/nothing.py"]) == 1
+    assert "experiment file not found" in capsys.readouterr().err
+
+
+def test_views_that_are_no_numbers(entry, capsys) -> None:
+    with pytest.raises(SystemExit):
+        entry.main(["configs/tiny_synthetic.py", "--views", "two"])
+    assert "expected view counts such as 2,4,8; got 'two'" in capsys.readouterr().err
+
+
+def test_the_table_of_the_shipped_model_is_of_the_fixed_benchmark(entry) -> None:
+    config = load_experiment(ROOT / "configs" / "tiny_synthetic.py")
+    benchmark = load_experiment(ROOT / "configs" / "synthetic_benchmark.py", "benchmark")
+    assert entry.captures_config(config) == benchmark
+    assert config.data.seed != entry.DEFAULT_SEED
+
+
+PROMISED_MPVPE_MM = 15.0
+"""At 4 views on the benchmark distribution. To be lowered to the README's figure with every better model."""
+
+
+def shipped_scores(entry, path: Path, samples: int, views: str) -> dict:
+    arguments = ["--seed", "987654", "--samples", str(samples), "--views", views, "--json", str(path)]
+    config_file = str(ROOT / "configs" / "tiny_synthetic.py")
+    assert entry.main([config_file, *arguments, "--no-progress"]) == 0
+    return json.loads(path.read_text())
+
+
+def test_the_shipped_model_is_there_and_of_its_experiment() -> None:
+    config, _ = shipped()
+    assert config == load_experiment(ROOT / "configs" / "tiny_synthetic.py").model
+
+
+def test_the_shipped_model_has_not_got_worse(entry, tmp_path) -> None:
+    """On 24 captures it may be off by half of what the README says of 200."""
+    scores = shipped_scores(entry, tmp_path / "r.json", 24, "4")["4"]
+    assert scores["mpvpe_mm"] <= 1.5 * PROMISED_MPVPE_MM
+    assert scores["mpvpe_mm"] <= scores["mean_pose_mpvpe_mm"] / 2
+
+
+@pytest.mark.slow
+def test_the_shipped_model_keeps_its_promise(entry, tmp_path) -> None:
+    scores = shipped_scores(entry, tmp_path / "r.json", 200, "2,4,8")
+    means = [scores[n]["mpvpe_mm"] for n in ("8", "4", "2")]
+    assert means == sorted(means)
+    assert means[1] <= PROMISED_MPVPE_MM
+    assert means[1] <= scores["4"]["mean_pose_mpvpe_mm"] / 3

@@ -1,0 +1,119 @@
+"""A model small enough for every test, with weights that make all of its parts matter."""
+
+import functools
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.geometry.cameras import Cameras
+from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
+from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.template import default_hand
+from poem_jax.models.basis import basis_points
+from poem_jax.models.config import (
+    BasisConfig,
+    Config,
+    DecoderConfig,
+    DecoderOutput,
+    HRNetConfig,
+    QueryStart,
+    ResNetConfig,
+    RootConfig,
+    Similarity,
+    Stem,
+)
+from poem_jax.models.parameters import describe
+
+_MICRO = Config(
+    image_hw=(32, 32),
+    width=16,
+    backbone=ResNetConfig(
+        blocks=(1, 1), channels=(8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
+    ),
+    basis=BasisConfig(num_points=64),
+    similarity=Similarity.MEAN,
+    decoder=DecoderConfig(num_layers=2, num_neighbours=4, ffn_expansion=1),
+)
+
+
+def drawn(config: Config, seed: int = 0) -> dict:
+    """Return random weights, so that zero initial ones hide nothing, without compiling anything."""
+    rng = np.random.default_rng(seed)
+
+    def draw(path, leaf):
+        name = path[-1].key
+        if name in ("scale", "variance"):
+            return rng.uniform(0.5, 1.5, leaf.shape).astype(np.float32)
+        fan_in = np.prod(leaf.shape[-4:-1]) if name == "kernel" else 4
+        return (rng.normal(size=leaf.shape) / np.sqrt(fan_in)).astype(np.float32)
+
+    shapes = describe(config)
+    weights = jax.tree_util.tree_map_with_path(draw, {k: shapes[k] for k in ("trainable", "statistics")})
+    return {**weights, "constants": constants(config)}
+
+
+@functools.cache
+def constants(config: Config) -> dict:
+    hand = default_hand()
+    rest = hand_mesh(hand, np.zeros((16, 3), np.float32), np.zeros(10, np.float32), center_joint=9)
+    return {
+        "basis_points": basis_points(config.basis),
+        "template_queries": np.concatenate(rest),
+        "hand": hand._asdict(),
+    }
+
+
+@pytest.fixture(scope="session")
+def micro_config() -> Config:
+    return _MICRO
+
+
+@pytest.fixture(scope="session")
+def joints_config() -> Config:
+    """All 21 joints, which also pose the template."""
+    decoder = replace(_MICRO.decoder, query_start=QueryStart.JOINTS, embed_coordinates=True)
+    return replace(_MICRO, root=RootConfig(num_joints=21), decoder=decoder)
+
+
+@pytest.fixture(scope="session")
+def parametric_config() -> Config:
+    return replace(_MICRO, decoder=replace(_MICRO.decoder, output=DecoderOutput.HAND_PARAMETERS))
+
+
+@pytest.fixture(scope="session")
+def hrnet_config() -> Config:
+    """The paper's trunk with every stage and kind of exchange, as thin as it gets; one decoder layer."""
+    trunk = HRNetConfig(4, stem_channels=4, stem_blocks=2, modules=(1, 1, 1), blocks=1)
+    return replace(_MICRO, backbone=trunk, decoder=replace(_MICRO.decoder, num_layers=1))
+
+
+@pytest.fixture(scope="session")
+def make_params():
+    """Return `params` of a config, made once per session."""
+    made: dict = {}
+
+    def make(config: Config) -> dict:
+        if config not in made:
+            made[config] = drawn(config)
+        return made[config]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_scene():
+    """Return random images and cameras that look at a point near the world's origin from all sides."""
+
+    def make(batch: int, views: int, seed: int = 0, hw: tuple[int, int] = (32, 32)):
+        rng = np.random.default_rng(seed)
+        R = rotation_from_axis_angle(rng.normal(size=(batch, views, 3)))
+        T = rigid(R, np.array([0.0, 0.0, 0.6]) + 0.02 * rng.normal(size=(batch, views, 3)))
+        f = 0.6 / 0.2 * hw[1]
+        K = np.tile(np.array([[f, 0, hw[1] / 2], [0, f, hw[0] / 2], [0, 0, 1]]), (batch, views, 1, 1))
+        images = rng.integers(0, 256, (batch, views, *hw, 3), dtype=np.uint8)
+        mask = np.ones((batch, views), bool)
+        return images, Cameras(K.astype(np.float32), T.astype(np.float32), mask)
+
+    return make

@@ -1,0 +1,116 @@
+import json
+from dataclasses import replace
+
+import pytest
+
+from poem_jax.models.config import (
+    BasisConfig,
+    Config,
+    DecoderConfig,
+    HRNetConfig,
+    QueryStart,
+    ResNetConfig,
+    RootConfig,
+    from_json,
+    to_json,
+)
+from poem_jax.models.presets import PRESETS, preset
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_json_gives_the_config_back(name):
+    config = preset(name)
+    assert from_json(to_json(config)) == config
+    assert hash(from_json(to_json(config))) == hash(config)
+
+
+def test_unknown_preset_is_named():
+    with pytest.raises(ValueError, match=r"`name` must be one of .*'v2-base'.*; got 'v3'"):
+        preset("v3")
+
+
+def test_unknown_key_fails():
+    text = json.loads(to_json(preset("tiny")))
+    text["decoder"]["num_heds"] = 4
+    with pytest.raises(ValueError, match=r"`config.decoder` has unknown keys \['num_heds'\]"):
+        from_json(json.dumps(text))
+
+
+def test_unknown_trunk_fails():
+    text = json.loads(to_json(preset("tiny")))
+    text["backbone"]["kind"] = "VGG"
+    with pytest.raises(ValueError, match=r"`config.backbone.kind` must be one of .*; got 'VGG'"):
+        from_json(json.dumps(text))
+
+
+def test_unknown_choice_fails():
+    text = json.loads(to_json(preset("tiny")))
+    text["similarity"] = "cosine"
+    with pytest.raises(ValueError, match="'cosine' is not a valid Similarity"):
+        from_json(json.dumps(text))
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        ("width", 16.0, r"`config.width` must be of type int; got 16.0"),
+        ("width", True, r"`config.width` must be of type int; got True"),
+        ("image_hw", [32], r"`config.image_hw` must have 2 entries; got \[32\]"),
+        ("image_hw", 32, r"`config.image_hw` must be a list; got 32"),
+        ("image_hw", [32, 32.5], r"`config.image_hw.1` must be of type int; got 32.5"),
+        ("image_mean", "half", r"`config.image_mean` must be of type float; got 'half'"),
+        ("decoder", 3, r"`config.decoder` must be an object; got 3"),
+        ("backbone", None, r"`config.backbone` must be an object; got None"),
+        ("decoder.num_layers", 0, r"`num_layers` must be whole and at least 1; got 0"),
+        ("decoder.embed_coordinates", 1, r"`config.decoder.embed_coordinates` must be of type bool; got 1"),
+    ],
+)
+def test_values_of_the_wrong_type_fail(where, value, message):
+    text = json.loads(to_json(preset("tiny")))
+    *owners, name = where.split(".")
+    owner = text[owners[0]] if owners else text
+    owner[name] = value
+    with pytest.raises(ValueError, match=message):
+        from_json(json.dumps(text))
+
+
+def test_a_whole_number_is_a_good_float():
+    text = json.loads(to_json(preset("tiny")))
+    text["image_std"] = 1
+    assert from_json(json.dumps(text)) == preset("tiny")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Config(image_hw=(0, 32)), "`image_hw` must be whole and at least 1"),
+        (lambda: Config(image_std=0.0), "`image_std` positive; got 0.5, 0.0"),
+        (lambda: DecoderConfig(num_layers=0), "`num_layers` must be whole and at least 1; got 0"),
+        (lambda: DecoderConfig(num_neighbours=0), "`num_neighbours` must be whole"),
+        (lambda: BasisConfig(num_points=0), "`num_points` must be whole"),
+        (lambda: BasisConfig(radius=-0.1), "`radius` must be positive and finite, metres; got -0.1"),
+        (lambda: ResNetConfig(blocks=(1, 0), channels=(8, 8)), "`blocks` must be whole"),
+        (lambda: HRNetConfig(width=0), "`width` must be whole"),
+        (lambda: Config(image_hw=(250, 256)), "`image_hw` must be multiples"),
+        (lambda: Config(feature_stride=7), "`feature_stride` must be one of"),
+        (lambda: Config(root=RootConfig(stride=3)), "`root.stride` must be one of"),
+        (lambda: Config(width=100), "`width` must be a multiple"),
+        (lambda: Config(basis=BasisConfig(num_points=16)), "`num_neighbours` must not exceed"),
+        (lambda: RootConfig(num_joints=16), "`num_joints` must be 1"),
+        (lambda: ResNetConfig(blocks=(1, 2)), "must name the same stages"),
+        (
+            lambda: Config(decoder=DecoderConfig(query_start=QueryStart.JOINTS)),
+            "`query_start` = joints needs",
+        ),
+    ],
+)
+def test_rules_are_checked_on_construction(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_configs_are_immutable():
+    config = preset("v2-base")
+    with pytest.raises(AttributeError):
+        config.width = 3  # pyright: ignore[reportAttributeAccessIssue]
+    assert replace(config, width=128) == preset("v2-small")

@@ -1,0 +1,29 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from poem_jax.models.convolution import Conv
+
+
+@pytest.mark.parametrize("size", [1, 3, 7])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_convolution_is_a_sum_over_windows(size, stride):
+    conv = Conv(2, 3, size, stride, bias=True, rngs=nnx.Rngs(0))
+    x = np.random.default_rng(0).normal(size=(1, 8, 6, 2)).astype(np.float32)
+    pad = (size - 1) // 2
+    padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
+    kernel = np.asarray(conv.kernel[...])
+    expected = np.zeros((1, 8 // stride, 6 // stride, 3))
+    for i in range(8 // stride):
+        for j in range(6 // stride):
+            window = padded[0, i * stride : i * stride + size, j * stride : j * stride + size]
+            expected[0, i, j] = np.einsum("hwc,hwcd->d", window, kernel)
+    np.testing.assert_allclose(conv(jnp.asarray(x)), expected, atol=1e-5)
+
+
+def test_first_weights_keep_the_variance():
+    conv = Conv(64, 64, 3, rngs=nnx.Rngs(0))
+    x = jax.random.normal(jax.random.key(1), (4, 16, 16, 64))
+    assert 1.6 < float(jnp.var(conv(x)[:, 2:-2, 2:-2])) < 2.4

@@ -1,0 +1,40 @@
+"""What the README and the documents promise: no blanks, no dead links, commands and code that work."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+DOCUMENTS = [README, *sorted((ROOT / "docs").glob("*.md"))]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+PLACEHOLDER = re.compile(r"@[A-Z][A-Z0-9_]*@")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_no_number_is_left_blank(document: Path) -> None:
+    assert PLACEHOLDER.findall(document.read_text()) == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_linked_files_and_pictures_exist(document: Path) -> None:
+    targets = [t.split("#")[0] for t in LINK.findall(document.read_text()) if "://" not in t]
+    assert [t for t in targets if t and not (document.parent / t).exists()] == []
+
+
+def test_commands_of_the_readme_are_targets_of_make() -> None:
+    commands = set(re.findall(r"(?:^|`)make ([a-z][a-z-]*)", README.read_text(), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert {"demo", "test"} <= commands
+    assert commands <= targets
+
+
+def test_the_code_of_the_readme_runs_and_reconstructs_a_hand(capsys, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert 5 <= len(code.strip().splitlines()) <= 12
+    exec(compile(code, str(README), "exec"), {"__name__": "readme"})
+    error, unit = capsys.readouterr().out.split()
+    assert unit == "mm"
+    assert 0 < float(error) < 30

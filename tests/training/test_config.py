@@ -1,0 +1,201 @@
+"""Experiment files, overrides, and the comparison of configs."""
+
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.batch import MultiViewBatch
+from poem_jax.geometry.cameras import Cameras
+from poem_jax.models.config import HRNetConfig
+from poem_jax.models.parameters import describe
+from poem_jax.training.config import (
+    BatchShape,
+    DataConfig,
+    OptimizerConfig,
+    RunConfig,
+    TrainConfig,
+    config_json,
+    differences,
+    flatten_config,
+    git_commit,
+    load_experiment,
+    override,
+)
+from poem_jax.training.state import create_state
+from poem_jax.training.step import train_step
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPERIMENTS = sorted(p for p in (ROOT / "configs").glob("*.py") if "\nconfig = " in p.read_text())
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda p: p.stem)
+def test_every_experiment_file_loads(path):
+    config = load_experiment(path)
+    assert config.name == path.stem
+    doc = path.read_text()
+    for part in ("What:", "Hardware:", "Time:", "Expected:", "Command:", f"train.py configs/{path.name}"):
+        assert part in doc
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda p: p.stem)
+def test_every_experiment_builds(path):
+    """Shapes only; nothing is computed."""
+    config = load_experiment(path)
+    state = jax.eval_shape(partial(create_state, config=config), describe(config.model))
+    assert sum(leaf.size for leaf in jax.tree.leaves(state.params["trainable"])) > 1e6
+
+
+def abstract_batch(config: TrainConfig) -> MultiViewBatch:
+    """Shapes of the experiment's largest batch."""
+    kind = max(config.data.batches, key=lambda shape: shape.num_views)
+    n, v = kind.batch_size, kind.num_views
+
+    def array(*shape, dtype=np.float32):
+        return jax.ShapeDtypeStruct((n, *shape), dtype)
+
+    return MultiViewBatch(
+        views=array(v, *config.model.image_hw, 3, dtype=np.uint8),
+        cameras=Cameras(array(v, 3, 3), array(v, 4, 4), array(v, dtype=bool)),
+        joints_world=array(21, 3),
+        vertices_world=array(778, 3),
+        keypoints_px=array(v, 21, 2),
+        pose=array(16, 3),
+        shape=array(10),
+        sample_mask=array(dtype=bool),
+    )
+
+
+def traced_quickly_or_slow(path: Path):
+    """Tracing the gradient of the paper's trunk takes about half a minute."""
+    model = load_experiment(path).model
+    marks = [pytest.mark.slow] if isinstance(model.backbone, HRNetConfig) else []
+    return pytest.param(path, marks=marks, id=path.stem)
+
+
+@pytest.mark.parametrize("path", [traced_quickly_or_slow(path) for path in EXPERIMENTS])
+def test_the_step_of_every_experiment_fits_its_model_and_data(path):
+    """Shapes only: the next state has the form of the last, and every metric is a number."""
+    config = load_experiment(path)
+    state = jax.eval_shape(partial(create_state, config=config), describe(config.model))
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    after, metrics = jax.eval_shape(partial(train_step, config=config), state, abstract_batch(config), key)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
+        lambda x: (x.shape, x.dtype), state
+    )
+    assert {"loss", "mpvpe_mm", "keypoint_px", "gradient_norm"} <= metrics.keys()
+    assert all(value.shape == () for value in metrics.values())
+
+
+def test_load_experiment_errors(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"experiment file not found: .*absent\.py"):
+        load_experiment(tmp_path / "absent.py")
+    (tmp_path / "empty.py").write_text("other = 1\n")
+    with pytest.raises(ValueError, match=r"must define `config`; it defines .*other"):
+        load_experiment(tmp_path / "empty.py")
+
+
+def test_overrides_are_typed_and_unknown_ones_fail(micro_config, capsys):
+    changed = override(
+        micro_config, ["--train.max-minutes", "1.5", "--loss.layers", "last", "--model.width", "32"]
+    )
+    assert (changed.train.max_minutes, changed.loss.layers.value, changed.model.width) == (1.5, "last", 32)
+    assert override(micro_config, []) == micro_config
+    for wrong in (["--train.stepz", "3"], ["--train.steps", "many"]):
+        with pytest.raises(SystemExit):
+            override(micro_config, wrong)
+
+
+def test_cross_field_rules(micro_config):
+    with pytest.raises(ValueError, match=r"multiple of `train.host_devices` = 3; got \[8\]"):
+        replace(micro_config, train=RunConfig(host_devices=3))
+    with pytest.raises(ValueError, match=r"`min_views` must lie in 1..num_views = 2; got 3"):
+        BatchShape(num_views=2, min_views=3)
+    with pytest.raises(ValueError, match="at least one shape"):
+        DataConfig(batches=())
+    small = replace(micro_config.data.synthetic, image_hw=(64, 64))
+    with pytest.raises(ValueError, match=r"must be the model's \(32, 32\); got \(64, 64\)"):
+        replace(micro_config, data=replace(micro_config.data, synthetic=small))
+    with pytest.raises(ValueError, match=r"asks for 4 views, but `data.synthetic.num_views` is 3"):
+        replace(micro_config, data=replace(micro_config.data, batches=(BatchShape(4, 8),)))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"log_every": 0}, "`train.log_every` must be at least 1; got 0"),
+        ({"checkpoint_every": 0}, "`train.checkpoint_every` must be at least 1; got 0"),
+        ({"keep_checkpoints": 0}, "`train.keep_checkpoints` must be at least 1; got 0"),
+        ({"validate_every": -1}, "`train.validate_every` must be at least 0; got -1"),
+        ({"validation_samples": 0}, "`train.validation_samples` must be at least 1; got 0"),
+        ({"host_devices": 0}, "`train.host_devices` must be at least 1; got 0"),
+        ({"max_minutes": 0.0}, "`train.max_minutes` must be positive, or None; got 0.0"),
+        ({"validation_views": ()}, r"`train.validation_views` must name view counts from 1; got \(\)"),
+        ({"validation_views": (0, 2)}, r"`train.validation_views` must name .*; got \(0, 2\)"),
+    ],
+)
+def test_rules_of_a_run(options, message):
+    with pytest.raises(ValueError, match=message):
+        RunConfig(**options)
+
+
+def test_validation_needs_cameras_that_exist(micro_config):
+    run = replace(micro_config.train, validation_views=(9,))
+    replace(micro_config, train=run)
+    with pytest.raises(ValueError, match=r"must not exceed `data.synthetic.num_views` = 3; got \(9,\)"):
+        replace(micro_config, train=replace(run, validate_every=1))
+
+
+def test_the_commit_is_the_packages_own(tmp_path, monkeypatch):
+    """Not that of the folder one happens to stand in, nor that of a project into which it is installed."""
+
+    def git(*arguments):
+        user = ("-c", "user.name=n", "-c", "user.email=n@e.invalid")
+        done = subprocess.run(["git", *user, *arguments], cwd=tmp_path, check=True, capture_output=True)
+        return done.stdout.decode().strip()
+
+    (tmp_path / "module.py").write_text("")
+    (tmp_path / "installed.py").write_text("")
+    if shutil.which("git") is None:
+        pytest.skip("needs git")
+    assert git_commit(tmp_path / "module.py") == "unknown"
+    git("init", "-q")
+    git("add", "module.py")
+    git("commit", "-q", "-m", "first")
+    assert git_commit(tmp_path / "module.py") == git("rev-parse", "HEAD")
+    assert git_commit(tmp_path / "installed.py") == "unknown"
+    (tmp_path / "module.py").write_text("changed = 1")
+    assert git_commit(tmp_path / "module.py") == git("rev-parse", "HEAD") + "+changes"
+    before = git_commit().removesuffix("+changes")
+    monkeypatch.chdir(tmp_path)
+    assert git_commit().removesuffix("+changes") == before != git("rev-parse", "HEAD")
+
+
+def test_a_longer_run_is_another_run_only_if_its_schedule_spans_it(micro_config):
+    longer = replace(micro_config, train=replace(micro_config.train, steps=9))
+    assert differences(flatten_config(micro_config), flatten_config(longer)) == []
+    open_ended = [replace(c, optimizer=OptimizerConfig()) for c in (micro_config, longer)]
+    assert differences(*map(flatten_config, open_ended)) == ["optimizer.decay_steps: 4 -> 9"]
+
+
+def test_differences_name_the_field_and_leave_bookkeeping_out(micro_config):
+    other = replace(
+        micro_config,
+        train=replace(micro_config.train, out="elsewhere", log_every=7, seed=5),
+        optimizer=replace(micro_config.optimizer, learning_rate=0.5),
+    )
+    assert differences(flatten_config(micro_config), flatten_config(other)) == [
+        "optimizer.learning_rate: 0.001 -> 0.5",
+        "train.seed: 0 -> 5",
+    ]
+    assert '"model.backbone.stem": "space_to_depth"' in config_json(micro_config)
+
+
+def test_configs_hash_and_compare(micro_config):
+    assert isinstance(micro_config, TrainConfig)
+    assert hash(micro_config) == hash(replace(micro_config))
