@@ -11,12 +11,14 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.atomic import whole_file
+from poem_jax.io.seal import check_seal, write_seal
 from poem_jax.models.poem import init
 from poem_jax.training.config import TrainConfig, config_json, differences, flatten_config, git_commit
 from poem_jax.training.state import TrainState, create_state, evaluation_params
 from poem_jax.weights.store import check_leaves, flatten, save, unflatten
 
 _FOLDER = "checkpoints"
+_SEALS = "seals"
 _CONFIG = "train_config.json"
 _COMMIT = "git_commit.txt"
 
@@ -28,6 +30,7 @@ class Checkpoints:
         """Open or make a run directory; `read_only` leaves it to the run that may be writing there."""
         self.run_dir = Path(run_dir).resolve()
         self.config = config
+        self._read_only = read_only
         check_same_config(self.run_dir, config)
         self._meta = {"config": flatten_config(config), "git_commit": git_commit()}
         if not read_only:
@@ -48,7 +51,22 @@ class Checkpoints:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._orbax.close()
+        try:
+            if kind is None and not self._read_only:
+                self.finish()
+        finally:
+            self._orbax.close()
+
+    def finish(self) -> None:
+        """Wait for the write in the background, and seal what is new; seals of removed steps go."""
+        self._orbax.wait()
+        steps = {saved.step for saved in self._orbax.checkpoints}
+        for seal in (self.run_dir / _SEALS).glob("*.json"):
+            if seal.stem not in map(str, steps):
+                seal.unlink()
+        for step in steps:
+            if not self._seal(step).is_file():
+                write_seal(self._seal(step), self.run_dir / _FOLDER / str(step))
 
     @property
     def latest_step(self) -> int | None:
@@ -61,14 +79,15 @@ class Checkpoints:
 
         The state is copied before this returns, since the next step may overwrite its donated buffers.
         """
-        self._orbax.wait()
+        self.finish()
         step = int(state.step)
         if step == self.latest_step:
             return
+        self._seal(step).unlink(missing_ok=True)
         leaves = flatten(jax.tree.map(jnp.copy, state))
         self._orbax.save_async(step, leaves, force=True, custom_metadata=self._meta)
         if wait:
-            self._orbax.wait()
+            self.finish()
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
         """Read a checkpoint (the newest by default) onto the devices and shardings of `like`.
@@ -82,8 +101,10 @@ class Checkpoints:
             raise FileNotFoundError(f"no checkpoint in {self.run_dir / _FOLDER}")
         template = flatten(like)
         try:
+            check_seal(self._seal(step), self.run_dir / _FOLDER / str(step))
             leaves = self._orbax.load(step, template)
         except Exception as error:
+            # Orbax and TensorStore raise many kinds; each means that the arrays cannot be read.
             raise ValueError(
                 f"checkpoint {step} in {self.run_dir / _FOLDER} is damaged or belongs to another model "
                 f"({type(error).__name__}: {str(error)[:300]}). Remove that step's folder to go on from an "
@@ -91,6 +112,9 @@ class Checkpoints:
             ) from error
         check_leaves(leaves, template, f"checkpoint {step} in {self.run_dir}")
         return unflatten(leaves, like)
+
+    def _seal(self, step: int) -> Path:
+        return self.run_dir / _SEALS / f"{step}.json"
 
     def _write_identity(self) -> None:
         with whole_file(self.run_dir / _CONFIG) as file:

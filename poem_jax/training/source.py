@@ -11,6 +11,9 @@ from poem_jax.training.config import BatchShape, DataConfig, TrainConfig
 
 BatchAt = Callable[[int], MultiViewBatch]
 
+_BATCH_STREAM = 1000
+"""Third part of the seed of a batch's layout; the dataset's own streams of a sample are small numbers."""
+
 
 def synthetic_batches(config: DataConfig) -> BatchAt:
     """Return the function from a step to its batch.
@@ -22,7 +25,7 @@ def synthetic_batches(config: DataConfig) -> BatchAt:
     largest = max(shape.batch_size for shape in config.batches)
 
     def batch_at(step: int) -> MultiViewBatch:
-        rng = np.random.default_rng((config.seed, step))
+        rng = np.random.default_rng((config.seed, step, _BATCH_STREAM))
         shape = choose_shape(config, rng)
         counts = rng.integers(
             shape.min_views or shape.num_views, shape.num_views, shape.batch_size, endpoint=True

@@ -1,4 +1,4 @@
-"""Weights on disk: a folder with `config.json` and `ckpt/`, an Orbax checkpoint of the parameters.
+"""Weights on disk: `config.json`, `ckpt/` (an Orbax checkpoint) and `seal.json` (its digests).
 
 The config travels with the weights, so that a checkpoint loads without its experiment file. Writing goes to a
 temporary folder beside the target, which is renamed when it is whole.
@@ -16,12 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
+from poem_jax.io.seal import check_seal, write_seal
 from poem_jax.models.config import Config, from_json, to_json
 from poem_jax.models.parameters import describe
 from poem_jax.typing import Array, Params, PyTree
 
 CONFIG_FILE = "config.json"
 ARRAYS_FOLDER = "ckpt"
+SEAL_FILE = "seal.json"
 SHIPPED = Path(__file__).parent / "tiny"
 """The weights that come with the package."""
 
@@ -57,6 +59,7 @@ def save(
     try:
         (temporary / CONFIG_FILE).write_text(to_json(config) + "\n", encoding="utf-8")
         ocp.save(str((temporary / ARRAYS_FOLDER).resolve()), stored)
+        write_seal(temporary / SEAL_FILE, temporary / ARRAYS_FOLDER)
         temporary.chmod(0o755)
         _put_in_place(temporary, path)
     finally:
@@ -100,7 +103,7 @@ def load(path: str | os.PathLike, *, expected: Config | None = None) -> tuple[Co
             f"checkpoint of another config at {path}: {_config_difference(expected, config)}. "
             "Build the model from the config that `load` returns, or load the checkpoint of this config"
         )
-    stored = _read_arrays(path / ARRAYS_FOLDER)
+    stored = _read_arrays(path)
     template = expected_leaves(config)
     check_leaves(stored, template, f"checkpoint at {path}")
     _check_finite(stored, f"checkpoint at {path}")
@@ -210,12 +213,15 @@ def _read_config(path: Path) -> Config:
         ) from error
 
 
-def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    folder = path / ARRAYS_FOLDER
     try:
+        check_seal(path / SEAL_FILE, folder)
         return cast(dict[str, np.ndarray], ocp.load(str(folder.resolve())))
     except Exception as error:
+        # Orbax and TensorStore raise many kinds; each means that the arrays cannot be read.
         raise ValueError(
-            f"{folder} is truncated or not an Orbax checkpoint ({type(error).__name__}: {str(error)[:200]}). "
+            f"{folder} is truncated or not an Orbax checkpoint ({type(error).__name__}: {str(error)[:300]}). "
             "Copy the whole folder again, or save it anew"
         ) from error
 

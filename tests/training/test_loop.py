@@ -143,7 +143,9 @@ def test_a_damaged_checkpoint_says_what_to_do(micro_config, micro_params):
         checkpoints.save(state, wait=True)
         for file in checkpoints.run_dir.glob("checkpoints/0/state/**/d/*"):
             file.write_bytes(file.read_bytes()[:40])
-        with pytest.raises(ValueError, match=r"checkpoint 0 in .* is damaged .*Remove that step's folder"):
+        with pytest.raises(
+            ValueError, match=r"checkpoint 0 in .* is damaged .*got 40.*Remove that step's folder"
+        ):
             checkpoints.restore(state)
     with (
         Checkpoints(Path(config.train.out) / "none", config) as checkpoints,

@@ -175,7 +175,9 @@ def test_truncated_arrays_are_a_value_error(saved):
     for file in (saved / "ckpt").rglob("*"):
         if file.is_file() and file.stat().st_size > 300:
             file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(ValueError, match=r"is truncated or not an Orbax checkpoint .*Copy the whole folder"):
+    with pytest.raises(
+        ValueError, match=r"is truncated or not an Orbax .*bytes, got 200.*Copy the whole folder"
+    ):
         store.load(saved)
 
 
