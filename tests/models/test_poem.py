@@ -1,6 +1,7 @@
 """The whole model on a micro config: invariances, gradients, transformations, compilations."""
 
 import functools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,13 @@ METRES = 2e-5
 
 @pytest.fixture(params=CONFIGS)
 def model(request, make_params):
-    """Return `apply` with one of the micro configs."""
+    """Return `apply` with one of the micro configs.
+
+    Every basis point is a neighbour of every query: which of two equally near points is taken would depend on
+    rounding, and the tests below compare exactly what rounding may not change.
+    """
     config = request.getfixturevalue(request.param)
+    config = replace(config, decoder=replace(config.decoder, num_neighbours=config.basis.num_points))
     return functools.partial(apply, make_params(config), config=config)
 
 
@@ -88,9 +94,7 @@ def test_padding_by_masked_views_changes_nothing(micro, make_scene):
 def test_other_views_are_a_set(model, make_scene):
     views, cams = make_scene(2, 4)
     turned = model(*_take_views(views, cams, [0, 2, 3, 1]))
-    moved = np.abs(_points(turned) - _points(model(views, cams))).max(-1) > METRES
-    # Where two basis points are equally near to a query, rounding decides which of them is its neighbour.
-    assert moved.mean() < 1e-3
+    np.testing.assert_allclose(_points(turned), _points(model(views, cams)), atol=METRES)
 
 
 def test_prediction_moves_with_the_world(model, make_scene):

@@ -15,6 +15,8 @@ NUM_BONES = 16
 _FINGER_WIDTH_MM = 3.4
 _PALM_WIDTH_MM = 7.0
 _MAX_BONES = 4
+_TIE_DIGITS = 9
+"""Distances in mm that agree to so many digits count as equal, whatever rounding made of them."""
 
 
 def first_bone(name: str) -> int:
@@ -109,12 +111,17 @@ def skin_weights(mesh: Mesh, spread: float = 1.0) -> np.ndarray:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
+def _nearest_first(gap: np.ndarray) -> np.ndarray:
+    """Order vertices by distance; of equally near ones the last comes first, on every machine."""
+    return np.lexsort((-np.arange(len(gap)), np.round(gap, _TIE_DIGITS)))
+
+
 def joint_regressor(v: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """(16, 778), non-negative: vertices near each joint, weighted so that they average to it exactly."""
     regressor = np.zeros((len(joints), len(v)))
     for j, joint in enumerate(joints):
         gap = np.linalg.norm(v - joint, axis=1)
-        near = np.argsort(gap)[:32]
+        near = _nearest_first(gap)[:32]
         scale = gap[near].mean()
         prior = np.exp(-0.5 * (gap[near] / (0.8 * scale)) ** 2)
         prior /= prior.sum()
