@@ -13,20 +13,12 @@ Command:   python train.py configs/v2_base_synthetic.py
 from dataclasses import replace
 
 from configs.synthetic_benchmark import benchmark
-from poem_jax.losses import PAPER
 from poem_jax.models.presets import preset
-from poem_jax.training.config import (
-    PAPER_ROOT,
-    BatchShape,
-    Clip,
-    DataConfig,
-    OptimizerConfig,
-    RunConfig,
-    Schedule,
-    TrainConfig,
-)
+from poem_jax.training.config import BatchShape, DataConfig, RunConfig
+from poem_jax.training.recipes import experiment
 
-config = TrainConfig(
+config = experiment(
+    "paper",
     name="v2_base_synthetic",
     model=preset("v2-base"),
     data=DataConfig(
@@ -35,11 +27,6 @@ config = TrainConfig(
         batches=(BatchShape(num_views=8, batch_size=32, min_views=1),),
         workers=8,
         prefetch=8,
-    ),
-    loss=PAPER,
-    training_root=PAPER_ROOT,
-    optimizer=OptimizerConfig(
-        learning_rate=1e-4, schedule=Schedule.COSINE, final_ratio=0.001, clip=Clip.GLOBAL, clip_norm=1.0
     ),
     train=RunConfig(
         steps=65_625, out="runs/v2_base_synthetic", log_every=50, checkpoint_every=1000, validate_every=2000

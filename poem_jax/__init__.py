@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from poem_jax.batch import MultiViewBatch, Prediction
     from poem_jax.geometry.cameras import Cameras
     from poem_jax.hand.model import HandModel
+    from poem_jax.models.inference import Prepared, infer, prepare
     from poem_jax.models.poem import apply, init, preset
     from poem_jax.weights.store import load, save
 
@@ -18,9 +19,12 @@ _HOME = {
     "HandModel": "poem_jax.hand.model",
     "MultiViewBatch": "poem_jax.batch",
     "Prediction": "poem_jax.batch",
+    "Prepared": "poem_jax.models.inference",
     "apply": "poem_jax.models.poem",
+    "infer": "poem_jax.models.inference",
     "init": "poem_jax.models.poem",
     "load": "poem_jax.weights.store",
+    "prepare": "poem_jax.models.inference",
     "preset": "poem_jax.models.poem",
     "save": "poem_jax.weights.store",
 }
@@ -32,9 +36,12 @@ __all__ = [
     "HandModel",
     "MultiViewBatch",
     "Prediction",
+    "Prepared",
     "apply",
+    "infer",
     "init",
     "load",
+    "prepare",
     "preset",
     "save",
 ]

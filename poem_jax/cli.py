@@ -1,4 +1,4 @@
-"""`poem`: hands from calibrated images, on the command line.
+"""`poem`: hands from calibrated images, and the weights for it, on the command line.
 
 Arguments are parsed before JAX is imported, so that help is quick and compiled programs can be kept between
 runs. Wrong input ends in one line and exit code 2.
@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 USAGE_ERROR = 2
 
 _Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+_File = Annotated[Path, tyro.conf.arg(metavar="FILE")]
 _Optional = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 _Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -74,6 +75,83 @@ class Reconstruct:
         _print_summary(written.report)
 
 
+@dataclass(frozen=True)
+class ImportTorch:
+    """Turn weights that POEM's authors released into a model folder; see docs/weights.md.
+
+    Reads the PyTorch file without PyTorch and runs nothing that is in it.
+    """
+
+    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CKPT")]
+    """The released .pth.tar."""
+    variant: Literal["v2-small", "v2-medium", "v2-large", "v2-medium-mano"]
+    """Which of the released models it is."""
+    mano: _File
+    """MANO_RIGHT.pkl from mano.is.tue.mpg.de, or an npz with MANO's names."""
+    assets: _Folder
+    """The folder assets of the authors' repository: bps.npy, anchor.npy, anchor_idx.npy."""
+    out: _Folder
+    """Folder to make for the model."""
+    accept_anchors: _Flag = False
+    """Take anchors that do not lie on the template of the hand."""
+    overwrite: _Flag = False
+    """Replace the model at --out."""
+    debug: _Flag = False
+    """Show the full traceback of an error."""
+
+    def run(self) -> None:
+        """Write the model and print what it was made of."""
+        from poem_jax.weights.release_files import import_release
+
+        start = time.perf_counter()
+        found = import_release(
+            self.checkpoint,
+            self.variant,
+            mano=self.mano,
+            assets=self.assets,
+            out=self.out,
+            accept_anchors=self.accept_anchors,
+            overwrite=self.overwrite,
+        )
+        print(f"{self.variant}: {found.num_parameters:,} parameters")
+        print(f"{found.num_read} arrays read, {found.num_ignored} ignored, for no output depends on them")
+        print(f"written to {self.out} in {time.perf_counter() - start:.1f} s; now try")
+        print(f"poem reconstruct CAPTURE --out out/ --checkpoint {self.out}")
+
+
+@dataclass(frozen=True)
+class ExportTorch:
+    """Turn a model folder back into a PyTorch state dict that the released code loads."""
+
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder of a released model, such as import-torch writes."""
+    out: _File
+    """The .pth.tar to write."""
+    overwrite: _Flag = False
+    """Replace the file at --out."""
+    debug: _Flag = False
+    """Show the full traceback of an error."""
+
+    def run(self) -> None:
+        """Write the file and print how to open it."""
+        from poem_jax.weights.release_files import export_release
+
+        count = export_release(self.model, self.out, overwrite=self.overwrite)
+        print(f"{count} arrays written to {self.out}; open it with")
+        print(f"torch.load({str(self.out)!r}, weights_only=True)")
+
+
+Command = Demo | Reconstruct | ImportTorch | ExportTorch
+
+
+def start() -> int:
+    """Run the `poem` command as installed: with the allocator that suits it, then `main`."""
+    from poem_jax.io.allocator import restart_with_settings
+
+    restart_with_settings()
+    return main()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0, or 2 with one line on standard error for wrong input."""
     logging.basicConfig(format="poem: %(message)s", level=logging.WARNING)
@@ -91,10 +169,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(arguments: Sequence[str] | None) -> Demo | Reconstruct:
-    reconstruct = Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+def _parse(arguments: Sequence[str] | None) -> Command:
+    commands = (
+        Annotated[Demo, tyro.conf.subcommand("demo")]
+        | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+        | Annotated[ImportTorch, tyro.conf.subcommand("import-torch")]
+        | Annotated[ExportTorch, tyro.conf.subcommand("export-torch")]
+    )
     return tyro.cli(
-        Annotated[Demo, tyro.conf.subcommand("demo")] | reconstruct,  # pyright: ignore[reportArgumentType]
+        commands,  # pyright: ignore[reportArgumentType]
         prog="poem",
         description="Metric 3D hands from any number of calibrated cameras.",
         args=arguments,
@@ -134,4 +217,4 @@ def _print_summary(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start())

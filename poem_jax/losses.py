@@ -17,7 +17,7 @@ from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.geometry.cameras import Cameras, anchor_to_primary, fill_masked_views, project
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import HandModel, joints_from_vertices
-from poem_jax.hand.topology import ROOT_JOINT, split_joints_first, split_vertices_first
+from poem_jax.hand.topology import ROOT_JOINT, QueryOrder, split_queries
 from poem_jax.typing import Array, Bool, Float
 
 
@@ -40,13 +40,6 @@ class PoseSpace(Enum):
 
     AXIS_ANGLE = "axis_angle"
     ROTATION = "rotation"
-
-
-class QueryOrder(Enum):
-    """The layout of the 799 query points in `Prediction.layers_world`."""
-
-    VERTICES_FIRST = "vertices_first"
-    JOINTS_FIRST = "joints_first"
 
 
 @dataclass(frozen=True)
@@ -249,13 +242,6 @@ def match_keypoints(prediction: Prediction, batch: MultiViewBatch) -> Float[Arra
     if prediction.keypoints_px.shape[-2] == 1:
         return batch.keypoints_px[..., ROOT_JOINT : ROOT_JOINT + 1, :]
     return batch.keypoints_px
-
-
-def split_queries(points: Float[Array, "*batch 799 3"], query_order: QueryOrder) -> tuple[Array, Array]:
-    """Split query points into (vertices, joints)."""
-    if query_order is QueryOrder.VERTICES_FIRST:
-        return split_vertices_first(points)
-    return split_joints_first(points)
 
 
 def _supervised(prediction: Prediction, layers: Layers, query_order: QueryOrder) -> list[_Points]:

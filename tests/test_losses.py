@@ -11,7 +11,7 @@ import pytest
 from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.hand.model import HandModel, joints_from_vertices
-from poem_jax.hand.topology import join_vertices_first
+from poem_jax.hand.topology import QueryOrder, join_vertices_first
 from poem_jax.losses import (
     PAPER,
     RECIPES,
@@ -20,7 +20,6 @@ from poem_jax.losses import (
     Layers,
     LossRecipe,
     Penalty,
-    QueryOrder,
     masked_mean,
     multi_view_losses,
 )

@@ -2,16 +2,17 @@
 
 import functools
 import os
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from poem_jax.batch import Prediction
 from poem_jax.capture.samples import HandResult, HandSample, empty_sample, take_result
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.models.config import Config
-from poem_jax.models.poem import apply
+from poem_jax.models.inference import Prepared, prepare, run_packed
 from poem_jax.typing import Params
 from poem_jax.weights import store
 
@@ -20,10 +21,10 @@ class Engine(NamedTuple):
     """A model and the number of hands that it takes at a time."""
 
     config: Config
-    params: Params
+    model: Prepared
     batch_size: int
-    run: Any
-    """The jitted forward pass: (params, views, cameras) -> Prediction."""
+    run: Callable[[Prepared, np.ndarray, Cameras], Prediction]
+    """The forward pass over a padded batch."""
     origin: str
     """Where the weights came from, for the report."""
 
@@ -41,13 +42,8 @@ def load_engine(checkpoint: str | os.PathLike | None, batch_size: int) -> Engine
 
 def make_engine(config: Config, params: Params, batch_size: int, origin: str = "given") -> Engine:
     """Build an engine from a model in memory."""
-    return Engine(config, params, batch_size, _program(config), origin)
-
-
-@functools.lru_cache(maxsize=8)
-def _program(config: Config) -> Any:
-    """One jitted function per config, so that several engines in one process compile once."""
-    return jax.jit(functools.partial(apply, config=config))
+    run = functools.partial(run_packed, config=config)
+    return Engine(config, prepare(params, config), batch_size, run, origin)
 
 
 def reconstruct_samples(engine: Engine, samples: Sequence[HandSample]) -> list[HandResult]:
@@ -63,5 +59,6 @@ def reconstruct_samples(engine: Engine, samples: Sequence[HandSample]) -> list[H
     padding = empty_sample(len(samples[0].view_mask), engine.config.image_hw)
     padded = [*samples, *[padding] * (engine.batch_size - len(samples))]
     views, K, T_cam_from_world, view_mask = (np.stack(part) for part in zip(*padded, strict=True))
-    prediction = jax.device_get(engine.run(engine.params, views, Cameras(K, T_cam_from_world, view_mask)))
+    cams = Cameras(K, T_cam_from_world, view_mask)
+    prediction = jax.device_get(engine.run(engine.model, views, cams))
     return [take_result(prediction, index) for index in range(len(samples))]

@@ -161,7 +161,7 @@ def batch_size(take: Take) -> int:
 
 def faces_by_side(engine: Engine) -> dict[str, Array]:
     """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
-    right = np.asarray(engine.params["constants"]["hand"]["faces"])
+    right = np.asarray(engine.model.params["constants"]["hand"]["faces"])
     return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
 
 

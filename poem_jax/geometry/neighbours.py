@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from poem_jax.typing import Array, Float, Int, Num
 
@@ -31,6 +32,15 @@ def nearest(
     best = jax.lax.top_k(candidates.reshape(*chosen.shape[:-1], k * _GROUP), k)[1]
     group = jnp.take_along_axis(chosen, best // _GROUP, axis=-1)
     return group * _GROUP + best % _GROUP
+
+
+def farthest_points(points: Float[np.ndarray, "point 3"], k: int) -> Int[np.ndarray, " k"]:
+    """Return k indices that spread over the points: 0, then always the point farthest from those taken."""
+    taken, gap = [0], np.full(len(points), np.inf)
+    for _ in range(k - 1):
+        gap = np.minimum(gap, np.sum((points - points[taken[-1]]) ** 2, -1))
+        taken.append(int(np.argmax(gap)))
+    return np.array(taken, np.int32)
 
 
 def gather(

@@ -6,6 +6,7 @@ middle, ring, little, each from the palm to the tip). Two sets of finger-tip ver
 that MANO's layer appends to its skeleton, and the one that goes with joints regressed from posed vertices.
 """
 
+import enum
 from typing import Final
 
 import numpy as np
@@ -56,6 +57,31 @@ BONES: Final = tuple(
     (WRIST if k == 0 else 4 * f + k, 4 * f + k + 1) for f in range(NUM_FINGERS) for k in range(4)
 )
 """The 20 (parent, child) pairs of key points, finger by finger."""
+
+
+class QueryOrder(enum.StrEnum):
+    """The layout of the 799 query points."""
+
+    VERTICES_FIRST = "vertices_first"
+    """[vertices, joints], as the paper writes them."""
+    JOINTS_FIRST = "joints_first"
+    """[joints, vertices], as the released models have them."""
+
+
+def join_queries(
+    vertices: Float[Array, "*batch 778 c"], joints: Float[Array, "*batch 21 c"], order: QueryOrder
+) -> Float[Array, "*batch 799 c"]:
+    """Lay out vertices and joints as queries in the given order."""
+    join = join_vertices_first if order is QueryOrder.VERTICES_FIRST else join_joints_first
+    return join(vertices, joints)
+
+
+def split_queries(
+    queries: Float[Array, "*batch 799 c"], order: QueryOrder
+) -> tuple[Float[Array, "*batch 778 c"], Float[Array, "*batch 21 c"]]:
+    """Undo `join_queries`: return (vertices, joints)."""
+    split = split_vertices_first if order is QueryOrder.VERTICES_FIRST else split_joints_first
+    return split(queries)
 
 
 def join_vertices_first(

@@ -8,11 +8,12 @@ stand-ins that merely keep their state. Any other global is refused by name befo
 """
 
 import codecs
+import contextlib
 import io
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from poem_jax.io.stored_array import StoredArray, StoredDtype, refuse_change
 
@@ -20,6 +21,7 @@ _NUMPY_CORE = ("numpy.core", "numpy._core")
 _BUILTINS = ("builtins", "__builtin__")
 _DEEPEST = 100
 _PLAIN = (str, bytes, int, float, bool, type(None))
+_SIZED = (str, bytes, list, tuple, dict, set, frozenset)
 _KEYS = {
     pickle.SETITEM: slice(-2, -1),
     pickle.SETITEMS: slice(0, None, 2),
@@ -28,6 +30,15 @@ _KEYS = {
     pickle.FROZENSET: slice(None),
 }
 """Where the keys lie on the reader's stack when an operation hashes them."""
+_GIVEN = {
+    pickle.REDUCE: slice(-1, None),
+    pickle.BUILD: slice(-1, None),
+    pickle.INST: slice(None),
+    pickle.OBJ: slice(None),
+}
+"""Where that lies which an operation hands to a callable, which may copy it."""
+_MOST_GIVEN, _GIVEN_BESIDES = 4, 2**16
+"""In all, callables may be given this many items for each byte of the pickle, and this many."""
 
 
 class StandIn:
@@ -53,6 +64,19 @@ class StandIn:
 
     def __repr__(self) -> str:
         return f"StandIn({self.module}.{self.name}: {sorted(self.state)})"
+
+
+class Vocabulary(NamedTuple):
+    """What a kind of file may say besides arrays and plain containers, and what each word becomes."""
+
+    names: Mapping[tuple[str, str], Any] = {}
+    """(module, name) of a global to what stands for it: an `Inert`, never the real thing."""
+    stand_ins: Callable[[str, str], bool] = lambda module, name: False
+    """True for the (module, name) of a class that may be replaced by a `StandIn`."""
+    persistent: Callable[[Any], Any] | None = None
+    """Describes an object outside the pickle by its id, whatever that is; None refuses them all."""
+    advice: str = "Do not trust this file."
+    """Ends the message about a global that is refused."""
 
 
 def load_arrays_pickle(
@@ -82,9 +106,35 @@ def loads_arrays_pickle(
     source: str = "the pickle",
 ) -> Any:
     """Read a pickle from memory; see `load_arrays_pickle`. `source` names it in messages."""
-    reader = _Reader(io.BytesIO(data), stand_ins, source)
+    with _problems_named(source):
+        described = _Reader(io.BytesIO(data), Vocabulary(stand_ins=stand_ins), source).load()
+        return _Finisher().finish(described)
+
+
+def describe_pickle(stream: io.BytesIO, vocabulary: Vocabulary, source: str) -> Any:
+    """Read one pickle and leave the stream right behind it; arrays stay the descriptions that they are.
+
+    Args:
+        stream: holds the pickle, and perhaps more after it.
+        vocabulary: what the pickle may say besides arrays and plain containers.
+        source: names the pickle in messages.
+
+    Returns:
+        Containers of plain values, of `StoredArray`s and of what the vocabulary makes; they may hold
+        themselves.
+
+    Raises:
+        ValueError: as for `load_arrays_pickle`, and whatever the vocabulary refuses.
+    """
+    with _problems_named(source):
+        return _Reader(stream, vocabulary, source).load()
+
+
+@contextlib.contextmanager
+def _problems_named(source: str) -> Iterator[None]:
+    """Turn whatever stops the reader into one ValueError that names the file."""
     try:
-        return _Finisher().finish(reader.load())
+        yield
     except _Refused as error:
         raise ValueError(str(error)) from None
     except RecursionError as error:
@@ -104,23 +154,35 @@ class _Refused(Exception):
 class _Reader(pickle._Unpickler):
     dispatch: ClassVar[dict] = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
 
-    def __init__(self, stream: io.BytesIO, stand_ins: Callable[[str, str], bool], source: str):
+    def __init__(self, stream: io.BytesIO, vocabulary: Vocabulary, source: str):
         super().__init__(stream, encoding="latin1")
-        self._stand_ins = stand_ins
+        self._vocabulary = vocabulary
         self._source = source
+        self._stream, self._start, self._given = stream, stream.tell(), 0
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
             return _ALLOWED[module, name]
-        if self._stand_ins(module, name):
+        if (module, name) in self._vocabulary.names:
+            return self._vocabulary.names[module, name]
+        if self._vocabulary.stand_ins(module, name):
             return type("StandIn", (StandIn,), {"module": module, "name": name})
         raise _Refused(
             f"{self._source} asks for {module}.{name}, which is not needed to hold arrays and is refused; "
-            "expected only NumPy arrays and plain containers. Do not trust this file."
+            f"expected only arrays and plain containers. {self._vocabulary.advice}"
         )
 
     def persistent_load(self, pid: Any) -> Any:
+        if self._vocabulary.persistent is not None:
+            return self._vocabulary.persistent(pid)
         raise _Refused(f"{self._source} refers to an object outside itself, which is refused")
+
+    def count_given(self, values: list) -> None:
+        """A short pickle could hand one long list to many calls, and fill the memory with copies."""
+        parts = (part for value in values if isinstance(value, tuple) for part in value)
+        self._given += sum(len(part) for part in (*values, *parts) if isinstance(part, _SIZED))
+        if self._given > _MOST_GIVEN * (self._stream.tell() - self._start) + _GIVEN_BESIDES:
+            raise ValueError("it uses the same contents again and again")
 
     def get_extension(self, code: int) -> Any:
         raise _Refused(f"{self._source} refers to a registered extension ({code}), which is refused")
@@ -129,18 +191,33 @@ class _Reader(pickle._Unpickler):
 def _with_plain_keys(operation: Callable[[Any], None], where: slice) -> Callable[[Any], None]:
     def checked(reader: Any) -> None:
         # Hashing deeply nested tuples overflows the interpreter's stack.
-        _check_keys(reader.stack[where])
+        check_keys(reader.stack[where])
         operation(reader)
 
     return checked
 
 
-def _check_keys(keys: Any) -> None:
+def check_keys(keys: Any) -> None:
+    """Allow keys of plain values alone.
+
+    Raises:
+        ValueError: one of `keys` is a container or a description.
+    """
     for key in keys:
         if not isinstance(key, _PLAIN):
             raise ValueError(f"keys must be text or numbers; got a {type(key).__name__}")
 
 
+def _with_counted_gifts(operation: Callable[[Any], None], where: slice) -> Callable[[Any], None]:
+    def counted(reader: Any) -> None:
+        reader.count_given(reader.stack[where])
+        operation(reader)
+
+    return counted
+
+
+for _code, _where in _GIVEN.items():
+    _Reader.dispatch[_code[0]] = _with_counted_gifts(_Reader.dispatch[_code[0]], _where)
 for _code, _where in _KEYS.items():
     _Reader.dispatch[_code[0]] = _with_plain_keys(_Reader.dispatch[_code[0]], _where)
 # A bytearray would be allocated before it is known whether the file is that long.
@@ -194,15 +271,21 @@ class _Finisher:
 _UNFINISHED = object()
 
 
-class _Inert:
+class Inert:
     """A name that a pickle may mention but neither change nor use as anything but what we make of it."""
 
     __slots__ = ("_build", "_name")
 
     def __init__(self, name: str, build: Callable[..., Any] | None = None):
+        """Take the name, for messages, and what a call of it builds; `build` must bear any arguments."""
         self._name, self._build = name, build
 
     def __call__(self, *args: Any) -> Any:
+        """Build what the pickle calls for.
+
+        Raises:
+            ValueError: nothing is built under this name.
+        """
         if self._build is None:
             raise ValueError(f"{self._name} may not be called")
         return self._build(*args)
@@ -211,8 +294,8 @@ class _Inert:
         refuse_change(self._name)
 
 
-_NDARRAY = _Inert("numpy.ndarray")
-_OBJECT = _Inert("object")
+_NDARRAY = Inert("numpy.ndarray")
+_OBJECT = Inert("object")
 
 
 def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> StoredArray:
@@ -251,7 +334,7 @@ def _set(members: Any = ()) -> set:
     """Build a set of names, such as chumpy keeps."""
     if not isinstance(members, list | tuple):
         raise ValueError(f"a set must be given its members in a list; got a {type(members).__name__}")
-    _check_keys(members)
+    check_keys(members)
     return set(members)
 
 
@@ -268,12 +351,12 @@ def _text(key: Any) -> str:
 
 _ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NDARRAY,
-    ("numpy", "dtype"): _Inert("numpy.dtype", StoredDtype),
-    ("_codecs", "encode"): _Inert("_codecs.encode", _encode),
-    **{(f"{core}.multiarray", "_reconstruct"): _Inert("_reconstruct", _reconstruct) for core in _NUMPY_CORE},
-    **{(f"{core}.multiarray", "scalar"): _Inert("scalar", _scalar) for core in _NUMPY_CORE},
-    **{(f"{core}.numeric", "_frombuffer"): _Inert("_frombuffer", _from_buffer) for core in _NUMPY_CORE},
-    **{(name, "_reconstructor"): _Inert("_reconstructor", _new_stand_in) for name in ("copyreg", "copy_reg")},
+    ("numpy", "dtype"): Inert("numpy.dtype", StoredDtype),
+    ("_codecs", "encode"): Inert("_codecs.encode", _encode),
+    **{(f"{core}.multiarray", "_reconstruct"): Inert("_reconstruct", _reconstruct) for core in _NUMPY_CORE},
+    **{(f"{core}.multiarray", "scalar"): Inert("scalar", _scalar) for core in _NUMPY_CORE},
+    **{(f"{core}.numeric", "_frombuffer"): Inert("_frombuffer", _from_buffer) for core in _NUMPY_CORE},
+    **{(name, "_reconstructor"): Inert("_reconstructor", _new_stand_in) for name in ("copyreg", "copy_reg")},
     **{(name, "object"): _OBJECT for name in _BUILTINS},
-    **{(name, "set"): _Inert("set", _set) for name in _BUILTINS},
+    **{(name, "set"): Inert("set", _set) for name in _BUILTINS},
 }

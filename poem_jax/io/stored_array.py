@@ -1,14 +1,16 @@
-"""What a pickle says of arrays, kept inert and checked before NumPy sees any of it.
+"""What a pickle says of arrays and tensors, kept inert and checked before NumPy sees any of it.
 
 `np.dtype` and `np.ndarray` trust the state that a pickle gives them: a forged one makes NumPy read bytes as
 pointers. The classes here take the same calls, accept only the few forms that NumPy writes for plain numbers,
-and make the array from bytes whose count was checked.
+and make the array from bytes whose count was checked. Tensors of PyTorch are views of storages, which lie
+outside the pickle; a view is checked against its storage before any number is read.
 """
 
 import math
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 _CODES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 _ORDERS = ("<", ">", "|")
@@ -96,6 +98,11 @@ class StoredArray:
             raise ValueError("the state of an array is not one that NumPy writes")
         self.fill(shape, dtype, "F" if is_fortran else "C", data)
 
+    @property
+    def nbytes(self) -> int:
+        """Size of the contents; 0 before they are given."""
+        return len(self._raw or b"")
+
     def array(self) -> Any:
         """Make the true array (a copy, writable) or scalar.
 
@@ -110,19 +117,113 @@ class StoredArray:
         return flat.reshape(self._shape, order=self._order).copy(order="K")  # type: ignore[call-overload]
 
 
+class TensorStorage:
+    """A row of `numel` numbers, from number `start` of the run that the file keeps under `key`."""
+
+    __slots__ = ("dtype", "key", "numel", "start")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, key: Any, dtype: np.dtype, numel: Any, start: Any = 0):
+        """Take what a pickle says.
+
+        Raises:
+            ValueError: a key that is no text, or counts that are no counts.
+        """
+        if not isinstance(key, str):
+            raise ValueError(f"a storage's key must be text; got a {type(key).__name__}")
+        if not _is_sizes((numel, start)):
+            raise ValueError(f"storage {_shown(key)} must have a count of numbers, at most {_LARGEST_BYTES}")
+        self.key, self.dtype, self.numel, self.start = key, dtype, numel, start
+
+    def __setstate__(self, state: Any) -> None:
+        refuse_change("a storage")
+
+    @property
+    def nbytes(self) -> int:
+        """Size in bytes."""
+        return self.numel * self.dtype.itemsize
+
+    def part(self, start: Any, numel: Any) -> "TensorStorage":
+        """Describe the numbers from `start` on.
+
+        Raises:
+            ValueError: the part is not within this storage.
+        """
+        part = TensorStorage(self.key, self.dtype, numel, start)
+        if start + numel > self.numel:
+            raise ValueError(f"{numel} numbers from {start} on leave a storage of {self.numel}")
+        return part
+
+
+class StoredTensor:
+    """A view of a storage: `shape`, and by how many numbers each axis steps."""
+
+    __slots__ = ("_offset", "_strides", "shape", "storage")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, storage: Any, offset: Any, shape: Any, strides: Any):
+        """Take what a pickle says.
+
+        Raises:
+            ValueError: no storage, no sizes, or a view that leaves its storage.
+        """
+        if not isinstance(storage, TensorStorage):
+            raise ValueError(f"a tensor must look at a storage; got a {type(storage).__name__}")
+        self.shape = _checked_sizes(shape, storage.dtype.itemsize)
+        if not _is_sizes(strides) or len(strides) != len(self.shape) or not _is_sizes((offset,)):
+            raise ValueError("a tensor must have an offset and one stride for each axis, none negative")
+        steps = sum((n - 1) * stride for n, stride in zip(self.shape, strides, strict=True))
+        # Without elements nothing is read, wherever the view may lie.
+        end = offset + steps + 1 if math.prod(self.shape) else 0
+        if end > storage.numel:
+            raise ValueError(
+                f"a tensor of shape {self.shape}, strides {strides} and offset {offset} reaches number {end} "
+                f"of a storage of {storage.numel}"
+            )
+        self.storage, self._offset, self._strides = storage, offset, strides
+
+    def __setstate__(self, state: Any) -> None:
+        refuse_change("a finished tensor")
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the array in bytes, larger than its part of the storage where a stride is 0."""
+        return math.prod(self.shape) * self.storage.dtype.itemsize
+
+    def array(self, numbers: np.ndarray) -> np.ndarray:
+        """Make the true array: a copy, in C order, writable.
+
+        Args:
+            numbers: all that the file keeps under the storage's key, shape (n,).
+        """
+        if not self.nbytes:
+            return np.empty(self.shape, numbers.dtype)
+        strides = tuple(stride * numbers.itemsize for stride in self._strides)
+        first = self.storage.start + self._offset
+        return as_strided(numbers[first:], self.shape, strides).copy(order="C")
+
+
 def _is_plain_state(state: tuple) -> bool:
     expected = (3, None, None, None, -1, -1, 0)
     got = (state[0], *state[2:])
     return all(type(a) is type(b) and a == b for a, b in zip(got, expected, strict=True))
 
 
-def _checked_shape(shape: Any, itemsize: int, num_bytes: int) -> tuple[int, ...]:
-    whole = isinstance(shape, tuple) and len(shape) <= _MOST_DIMENSIONS
-    if not whole or not all(type(n) is int and n >= 0 for n in shape):
-        raise ValueError("an array's shape must be a tuple of sizes")
+def _is_sizes(sizes: Any) -> bool:
+    whole = isinstance(sizes, tuple) and len(sizes) <= _MOST_DIMENSIONS
+    return whole and all(type(n) is int and 0 <= n <= _LARGEST_BYTES for n in sizes)
+
+
+def _checked_sizes(shape: Any, itemsize: int) -> tuple[int, ...]:
+    if not _is_sizes(shape):
+        raise ValueError("an array's shape must be a tuple of sizes, none beyond a file's")
     if math.prod(max(n, 1) for n in shape) * itemsize > _LARGEST_BYTES:
         raise ValueError("an array's shape is beyond any file's size")
-    expected = math.prod(shape) * itemsize
+    return shape
+
+
+def _checked_shape(shape: Any, itemsize: int, num_bytes: int) -> tuple[int, ...]:
+    expected = math.prod(_checked_sizes(shape, itemsize)) * itemsize
     if expected != num_bytes:
         raise ValueError(f"an array of shape {shape} needs {expected} bytes; got {num_bytes}")
     return shape

@@ -7,10 +7,8 @@ import numpy as np
 
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.sampling import sample_bilinear
-from poem_jax.models.config import BasisConfig, BasisSampling
+from poem_jax.models.config import BasisConfig, BasisSampling, BehindCamera
 from poem_jax.typing import Array, Float
-
-_TEMPERATURE = 10000.0
 
 
 def basis_points(config: BasisConfig) -> Float[np.ndarray, "basis 3"]:
@@ -35,26 +33,20 @@ def projected_features(
     cams: Cameras,
     points_world: Float[Array, "batch basis 3"],
     image_hw: tuple[int, int],
-) -> Float[Array, "batch view basis c"]:
-    """Sample every view's features where the points project, and add that position's code (paper, eq. 5-6).
+    behind: BehindCamera = BehindCamera.ZEROS,
+) -> tuple[Float[Array, "batch view basis c"], Float[Array, "batch view basis 2"]]:
+    """Sample every view's features where the points project (paper, eq. 5).
 
-    Points that project outside the image, or lie behind the camera, sample zeros.
+    Points that project outside the image sample zeros.
+
+    Returns: the features, and the projections as shares (u / W, v / H) of the image; zero for points behind
+    the camera, unless `behind` takes these as they are.
     """
     uv_px, depth = project(cams.K, cams.T_cam_from_world, points_world[:, None])
     uv_share = uv_px / jnp.array(image_hw[::-1], uv_px.dtype)
     cells_wh = jnp.array(feature_maps.shape[-3:-1][::-1], uv_px.dtype)
-    seen = (depth > 0)[..., None]
     sampled = sample_bilinear(feature_maps, uv_share * cells_wh)
-    return jnp.where(seen, sampled, 0) + sine_code(jnp.where(seen, uv_share, 0), feature_maps.shape[-1])
-
-
-def sine_code(uv_share: Float[Array, "*batch 2"], width: int) -> Float[Array, "*batch c"]:
-    """Encode positions (u / W, v / H) by sines (Carion et al. 2020, DETR).
-
-    y comes before x; sine and cosine of a frequency are interleaved.
-    """
-    half = width // 2
-    frequency = 2 * np.pi * _TEMPERATURE ** (-2.0 * np.arange(half // 2) / half)
-    angle = uv_share[..., ::-1, None] * jnp.asarray(frequency, uv_share.dtype)
-    code = jnp.stack([jnp.sin(angle), jnp.cos(angle)], -1)
-    return code.reshape(*uv_share.shape[:-1], width)
+    if behind is BehindCamera.MIRRORED:
+        return sampled, uv_share
+    seen = (depth > 0)[..., None]
+    return jnp.where(seen, sampled, 0), jnp.where(seen, uv_share, 0)

@@ -1,25 +1,19 @@
-"""Configuration of a POEM model: frozen dataclasses nested by owner, and their JSON form.
+"""Configuration of a POEM model: frozen dataclasses nested by owner.
 
-A choice that the paper and other builds make differently is a named field of the part that has it.
-Cross-field rules are checked on construction; unknown keys in a JSON text fail.
+A choice that the paper, the released models and our own make differently is a named field of the part that
+has it; the first entry of each enumeration is the paper's. Cross-field rules are checked on construction.
 """
 
-import dataclasses
 import enum
-import json
 import math
-import types
-import typing
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
-from poem_jax.hand.topology import NUM_JOINTS
-
-_T = TypeVar("_T")
-_KIND = "kind"
+from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, QueryOrder
 
 
-def _require(condition: bool, message: str) -> None:
+def require(condition: bool, message: str) -> None:
+    """Raise `ValueError(message)` unless the condition holds."""
     if not condition:
         raise ValueError(message)
 
@@ -29,7 +23,7 @@ def _require_counts(owner: Any, *names: str) -> None:
     for name in names:
         value = getattr(owner, name)
         entries = value if isinstance(value, tuple) else (value,)
-        _require(
+        require(
             all(type(entry) is int and entry >= 1 for entry in entries),
             f"`{name}` must be whole and at least 1; got {value}",
         )
@@ -59,7 +53,7 @@ class HRNetConfig:
 
     def __post_init__(self) -> None:
         _require_counts(self, "width", "stem_channels", "stem_blocks", "modules", "blocks")
-        _require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
+        require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -84,7 +78,7 @@ class ResNetConfig:
     stem_channels: int = 64
 
     def __post_init__(self) -> None:
-        _require(
+        require(
             len(self.blocks) == len(self.channels) >= 1,
             f"`blocks` and `channels` must name the same stages; got {self.blocks} and {self.channels}",
         )
@@ -138,14 +132,66 @@ class RootConfig:
     """1 = the root alone (paper); 21 = all joints, of which joint 9 is the root."""
     stride: int = 8
     """Pixels per heat-map cell."""
+    pooling: int = 1
+    """The branch ends so many times finer, and is max-pooled to `stride` (release: 2)."""
+    cell_offset: float = 0.5
+    """Cell i stands for pixel `stride` x (i + `cell_offset`); the release has 0."""
     activation: HeatActivation = HeatActivation.SIGMOID
     view_weights: ViewWeights = ViewWeights.EQUAL
+    unit_rows: bool = True
+    """Scale every row of the triangulation to unit norm; the release keeps raw pixels."""
 
     def __post_init__(self) -> None:
-        _require(
+        require(
             self.num_joints in (1, NUM_JOINTS),
             f"`num_joints` must be 1 (the root) or {NUM_JOINTS} (all joints); got {self.num_joints}",
         )
+        _require_counts(self, "stride", "pooling")
+        require(
+            self.stride % self.pooling == 0,
+            f"`pooling` must divide `stride` = {self.stride}; got {self.pooling}",
+        )
+
+    @property
+    def branch_stride(self) -> int:
+        """Pixels per cell where the branch ends."""
+        return self.stride // self.pooling
+
+
+class FeatureFusion(enum.StrEnum):
+    """How the feature branch joins the trunk's maps."""
+
+    TOP_DOWN = "top_down"
+    """The heat-map branch's design: enlarge, concatenate the finer map, convolve."""
+    BOTTOM_UP = "bottom_up"
+    """Convolve with stride 2, add the coarser map, to the coarsest; then enlarge once (release)."""
+
+
+class PositionCode(enum.StrEnum):
+    """What tells a sampled feature where it comes from."""
+
+    PROJECTED_POINT = "projected_point"
+    """Sines of the projected point, added to the samples."""
+    VIEW_ROW_COLUMN = "view_row_column"
+    """Sines of the number of the view, the row and the column, mixed and added to the map (release)."""
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Feature maps that the basis points sample."""
+
+    stride: int = 8
+    """Pixels per cell."""
+    fusion: FeatureFusion = FeatureFusion.TOP_DOWN
+    position_code: PositionCode = PositionCode.PROJECTED_POINT
+
+
+class BehindCamera(enum.StrEnum):
+    """What a basis point behind a camera reads there."""
+
+    ZEROS = "zeros"
+    MIRRORED = "mirrored"
+    """Whatever lies where it projects through the centre (release)."""
 
 
 class BasisSampling(enum.StrEnum):
@@ -166,10 +212,11 @@ class BasisConfig:
     """Metres."""
     sampling: BasisSampling = BasisSampling.BALL
     seed: int = 0
+    behind_camera: BehindCamera = BehindCamera.ZEROS
 
     def __post_init__(self) -> None:
         _require_counts(self, "num_points")
-        _require(
+        require(
             0 < self.radius < math.inf, f"`radius` must be positive and finite, metres; got {self.radius}"
         )
 
@@ -181,6 +228,70 @@ class Similarity(enum.StrEnum):
     """theta(f1) . theta(fj), as the paper writes it."""
     MEAN = "mean"
     """The same divided by its number of terms, so that its size does not grow with the width."""
+
+
+class Layout(enum.StrEnum):
+    """How an array gets axes in another order."""
+
+    BY_NAME = "by_name"
+    """The axes are moved; every number keeps its meaning."""
+    ROW_MAJOR = "row_major"
+    """The same memory is read under another shape, which mixes the axes; the released weights expect it."""
+
+
+class SingleView(enum.StrEnum):
+    """What the aggregation does where only one view is valid."""
+
+    PASS = "pass"
+    """Nothing: the features are those of the view."""
+    RESIDUAL = "residual"
+    """Adds phi(theta(f1)) (release)."""
+
+
+@dataclass(frozen=True)
+class AggregationConfig:
+    """Fusion of the views' features."""
+
+    similarity: Similarity = Similarity.DOT
+    layout: Layout = Layout.BY_NAME
+    """From (view, channel, point), as sampled, to (point, view, channel)."""
+    single_view: SingleView = SingleView.PASS
+    narrow_phi: bool = False
+    """phi's hidden layer is as narrow as its input; else phi is theta's mirror image."""
+
+
+class AttentionKeys(enum.StrEnum):
+    """What the first scalar attention of a layer reads; the second reads the basis."""
+
+    QUERIES = "queries"
+    BASIS = "basis"
+
+
+class FirstNeighbours(enum.StrEnum):
+    """Whom the vector attentions of the first layer read."""
+
+    NEAREST = "nearest"
+    ANCHORS = "anchors"
+    """Fixed rows at fixed positions, the same for every query, of queries and basis alike (release)."""
+
+
+class VectorForm(enum.StrEnum):
+    """The vector attention of a layer."""
+
+    BASIS = "basis"
+    """Queries read basis points; a residual sum and layer norm follow."""
+    QUERIES_THEN_BASIS = "queries_then_basis"
+    """Queries read queries, then basis points; each between two linear maps, with a residual sum, no norm,
+    and logits over the root of the width (release)."""
+
+
+class CoordinateUpdate(enum.StrEnum):
+    """What moves the query points."""
+
+    FEED_FORWARD = "feed_forward"
+    """The feed-forward network regresses offsets."""
+    BRANCH_BEFORE = "branch_before"
+    """A branch of two layers; the feed-forward network, a residual of the embeddings, follows (release)."""
 
 
 class NeighbourSearch(enum.StrEnum):
@@ -217,6 +328,16 @@ class DecoderConfig:
     num_neighbours: int = 32
     ffn_expansion: int = 4
     """Hidden width of the feed-forward network over the width of the embeddings."""
+    query_order: QueryOrder = QueryOrder.VERTICES_FIRST
+    first_attention: AttentionKeys = AttentionKeys.QUERIES
+    vector_form: VectorForm = VectorForm.BASIS
+    first_neighbours: FirstNeighbours = FirstNeighbours.NEAREST
+    coordinate_update: CoordinateUpdate = CoordinateUpdate.FEED_FORWARD
+    shared_embedding: bool = False
+    """Every layer begins with one linear map of queries and basis features."""
+    layer_norm_epsilon: float = 1e-5
+    dropout: float = 0.0
+    """Share of numbers dropped in training, where the release drops them."""
     query_start: QueryStart = QueryStart.TEMPLATE
     neighbour_search: NeighbourSearch = NeighbourSearch.EVERY_LAYER
     cross_attention_basis_stride: int = 1
@@ -224,10 +345,17 @@ class DecoderConfig:
     embed_coordinates: bool = False
     """Add a learned embedding of the 3D coordinates to queries (every layer) and basis features (once)."""
     output: DecoderOutput = DecoderOutput.OFFSETS
+    pooling: Layout = Layout.BY_NAME
+    """From (query, channel) to (channel, query), before the parametric output pools the queries."""
 
     def __post_init__(self) -> None:
         _require_counts(
             self, "num_layers", "num_heads", "num_neighbours", "ffn_expansion", "cross_attention_basis_stride"
+        )
+        require(0 <= self.dropout < 1, f"`dropout` must be in [0, 1); got {self.dropout}")
+        require(
+            self.vector_form is VectorForm.BASIS or self.num_neighbours <= NUM_QUERIES,
+            f"`num_neighbours` must not exceed the {NUM_QUERIES} queries; got {self.num_neighbours}",
         )
 
 
@@ -240,115 +368,57 @@ class Config:
     image_std: float = 1.0
     width: int = 256
     """Channels d of basis features and query embeddings."""
-    feature_stride: int = 8
-    """Pixels per cell of the feature maps that the basis points sample."""
     backbone: HRNetConfig | ResNetConfig = field(default_factory=HRNetConfig)
+    branch_bias: bool = False
+    """The convolutions of the two branches have a bias before their batch norm."""
     root: RootConfig = RootConfig()
+    features: FeatureConfig = FeatureConfig()
     basis: BasisConfig = BasisConfig()
-    similarity: Similarity = Similarity.DOT
+    aggregation: AggregationConfig = AggregationConfig()
     decoder: DecoderConfig = DecoderConfig()
 
     def __post_init__(self) -> None:
         _require_counts(self, "image_hw", "width")
-        _require(
+        require(
             isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
             f"`image_hw` must be (height, width); got {self.image_hw}",
         )
-        _require(
+        require(
             math.isfinite(self.image_mean) and 0 < self.image_std < math.inf,
             f"`image_mean` must be finite and `image_std` positive; got {self.image_mean}, {self.image_std}",
         )
         coarsest = self.backbone.strides[-1]
-        _require(
+        require(
             all(size % coarsest == 0 for size in self.image_hw),
             f"`image_hw` must be multiples of the trunk's coarsest stride {coarsest}; got {self.image_hw}",
         )
-        for name, stride in (("feature_stride", self.feature_stride), ("root.stride", self.root.stride)):
-            _require(
-                stride in self.backbone.strides,
-                f"`{name}` must be one of the trunk's strides {self.backbone.strides}; got {stride}",
-            )
-        _require(
+        strides = self.backbone.strides
+        for name, stride in (
+            ("features.stride", self.features.stride),
+            ("root.stride", self.root.stride),
+            ("root.stride / root.pooling", self.root.branch_stride),
+        ):
+            require(stride in strides, f"`{name}` must be one of the trunk's strides {strides}; got {stride}")
+        require(
+            self.features.fusion is FeatureFusion.TOP_DOWN or self.features.stride == strides[-2],
+            f"`features.stride` must be {strides[-2]} with `features.fusion` = bottom_up, which enlarges the "
+            f"trunk's coarsest map once; got {self.features.stride}",
+        )
+        require(
             self.width % (4 * self.decoder.num_heads) == 0,
             f"`width` must be a multiple of 4 x `num_heads` = {4 * self.decoder.num_heads}; got {self.width}",
         )
-        _require(
+        require(
             self.decoder.num_neighbours <= self.basis.num_points,
             f"`num_neighbours` must not exceed the {self.basis.num_points} basis points; "
             f"got {self.decoder.num_neighbours}",
         )
-        _require(
+        require(
+            self.decoder.first_neighbours is FirstNeighbours.NEAREST or self.basis.num_points >= NUM_QUERIES,
+            f"`decoder.first_neighbours` = anchors names rows of the {NUM_QUERIES} queries and of the basis "
+            f"alike, so `basis.num_points` must be at least {NUM_QUERIES}; got {self.basis.num_points}",
+        )
+        require(
             self.decoder.query_start is QueryStart.TEMPLATE or self.root.num_joints == NUM_JOINTS,
             f"`query_start` = joints needs `root.num_joints` = {NUM_JOINTS}; got {self.root.num_joints}",
         )
-
-
-def to_json(config: Config) -> str:
-    """Write a config as JSON text; dataclasses that are one of several carry their class name as `kind`."""
-    return json.dumps(_encode(config, Config), indent=2)
-
-
-def from_json(text: str) -> Config:
-    """Read a config from JSON text.
-
-    Raises:
-        ValueError: unknown key, missing or unknown `kind`, a value of the wrong type, or one that breaks a
-            rule of its dataclass.
-    """
-    return _decode(json.loads(text), Config, "config")
-
-
-def _encode(value: Any, declared: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        hints = typing.get_type_hints(type(value))
-        entries = {f.name: _encode(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
-        return {_KIND: type(value).__name__, **entries} if _is_union(declared) else entries
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _decode(value: Any, declared: Any, path: str) -> Any:
-    if _is_union(declared):
-        return _decode_union(value, declared, path)
-    if dataclasses.is_dataclass(declared):
-        return _decode_dataclass(value, typing.cast(type, declared), path)
-    if typing.get_origin(declared) is tuple:
-        return _decode_tuple(value, typing.get_args(declared), path)
-    if issubclass(declared, enum.Enum):
-        return declared(value)
-    # A bool is an int to Python; a whole number is a good float.
-    accepted = (int, float) if declared is float else (declared,)
-    _require(type(value) in accepted, f"`{path}` must be of type {declared.__name__}; got {value!r}")
-    return declared(value)
-
-
-def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any, ...]:
-    _require(isinstance(value, list), f"`{path}` must be a list; got {value!r}")
-    if entries[-1] is Ellipsis:
-        entries = entries[:1] * len(value)
-    _require(len(value) == len(entries), f"`{path}` must have {len(entries)} entries; got {value!r}")
-    return tuple(
-        _decode(v, declared, f"{path}.{i}")
-        for i, (v, declared) in enumerate(zip(value, entries, strict=True))
-    )
-
-
-def _decode_union(value: Any, declared: Any, path: str) -> Any:
-    _require(isinstance(value, dict), f"`{path}` must be an object; got {value!r}")
-    options = {option.__name__: option for option in typing.get_args(declared)}
-    kind = value.get(_KIND)
-    if kind not in options:
-        raise ValueError(f"`{path}.{_KIND}` must be one of {sorted(options)}; got {kind!r}")
-    return _decode_dataclass({k: v for k, v in value.items() if k != _KIND}, options[kind], path)
-
-
-def _decode_dataclass(value: Any, declared: type[_T], path: str) -> _T:
-    _require(isinstance(value, dict), f"`{path}` must be an object; got {value!r}")
-    hints = typing.get_type_hints(declared)
-    unknown = sorted(set(value) - set(hints))
-    if unknown:
-        raise ValueError(f"`{path}` has unknown keys {unknown}; known are {sorted(hints)}")
-    return declared(**{key: _decode(entry, hints[key], f"{path}.{key}") for key, entry in value.items()})
-
-
-def _is_union(declared: Any) -> bool:
-    return isinstance(declared, types.UnionType)

@@ -43,9 +43,17 @@ class ConvNorm(nnx.Module):
     """Convolution, batch norm and, unless told otherwise, ReLU."""
 
     def __init__(
-        self, c_in: int, c_out: int, size: int, stride: int = 1, *, relu: bool = True, rngs: nnx.Rngs
+        self,
+        c_in: int,
+        c_out: int,
+        size: int,
+        stride: int = 1,
+        *,
+        bias: bool = False,
+        relu: bool = True,
+        rngs: nnx.Rngs,
     ) -> None:
-        self.conv = Conv(c_in, c_out, size, stride, rngs=rngs)
+        self.conv = Conv(c_in, c_out, size, stride, bias=bias, rngs=rngs)
         self.norm = MaskedBatchNorm(c_out)
         self.relu = relu
 

@@ -1,21 +1,67 @@
 """Point-embedded Transformer decoder: query points read the basis points and move.
 
-Paper, section "Point-Embedded Transformer Decoder".
+Paper, section "Point-Embedded Transformer Decoder"; the released decoder by named choices of `DecoderConfig`.
 
 Coordinates are in units of the basis radius, about the root.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from poem_jax.geometry.neighbours import nearest
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models.attention import MultiHeadAttention
-from poem_jax.models.config import DecoderConfig, DecoderOutput, NeighbourSearch
-from poem_jax.models.linear import LayerNorm, Linear, zeros
-from poem_jax.models.vector_attention import VectorAttention
-from poem_jax.typing import Array, Float, Int
+from poem_jax.models.config import (
+    AttentionKeys,
+    CoordinateUpdate,
+    DecoderConfig,
+    DecoderOutput,
+    NeighbourSearch,
+    VectorForm,
+)
+from poem_jax.models.linear import LayerNorm, Linear, dropout, zeros
+from poem_jax.models.vector_attention import (
+    BracketedVectorAttention,
+    Neighbours,
+    VectorAttention,
+    anchored,
+    nearest_neighbours,
+)
+from poem_jax.typing import Array, Float, Int, PRNGKeyArray
+
+
+class Anchors(NamedTuple):
+    """Rows that all queries read in the first layer, and the positions that count for them."""
+
+    index: Int[Array, " k"]
+    positions: Float[Array, "k 3"]
+
+
+class Surroundings(NamedTuple):
+    """The neighbours of every query point."""
+
+    basis: Neighbours
+    queries: Neighbours | None
+    """None where queries do not read each other."""
+
+
+def around_anchors(anchors: Anchors) -> Surroundings:
+    """Let all queries of all samples read the same anchors, of queries and basis alike (batch 1)."""
+    everywhere = anchored(anchors.index, anchors.positions)
+    return Surroundings(everywhere, everywhere)
+
+
+def shared(surroundings: Surroundings, batch_size: int) -> Surroundings:
+    """Give the surroundings of one sample to a whole batch."""
+
+    def spread(near: Neighbours) -> Neighbours:
+        k, _, query = near.index.shape
+        return near._replace(index=jnp.broadcast_to(near.index, (k, batch_size, query)))
+
+    basis, queries = surroundings
+    return Surroundings(spread(basis), None if queries is None else spread(queries))
 
 
 class Decoder(nnx.Module):
@@ -24,9 +70,11 @@ class Decoder(nnx.Module):
     def __init__(self, config: DecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.config = config
         self.embeddings = nnx.Param(jax.random.normal(rngs.params(), (NUM_QUERIES, width)))
-        moving = config.num_layers - (config.output is DecoderOutput.HAND_PARAMETERS)
+        # The last layer regresses offsets or parameters, never both.
+        kinds = [DecoderOutput.OFFSETS] * (config.num_layers - 1) + [config.output]
         self.layers = nnx.List(
-            DecoderLayer(config, width, moves=i < moving, rngs=rngs) for i in range(config.num_layers)
+            DecoderLayer(config, width, output=kind, is_last=i == config.num_layers - 1, rngs=rngs)
+            for i, kind in enumerate(kinds)
         )
         self.locate = CoordinateEmbedding(width, rngs=rngs) if config.embed_coordinates else None
 
@@ -35,54 +83,135 @@ class Decoder(nnx.Module):
         queries: Float[Array, "batch query 3"],
         points: Float[Array, "basis 3"],
         features: Float[Array, "batch basis c"],
+        first: Surroundings | None = None,
+        dropout_key: PRNGKeyArray | None = None,
     ) -> tuple[list[Float[Array, "batch query 3"]], Float[Array, "batch query c"]]:
-        """Return the query points after every layer that moves them, and the last embeddings."""
+        """Return the query points after every layer that moves them, and the last embeddings.
+
+        `first`: whom the first layer reads, the same in all samples (batch 1); None = the nearest, as in the
+        other layers.
+        """
         embeddings = jnp.broadcast_to(self.embeddings[...], (*queries.shape[:-1], features.shape[-1]))
         if self.locate is not None:
             features = features + self.locate(points)
-        neighbours, moved = self._neighbours(queries, points), []
-        for layer in self.layers:
+        surroundings = self._surroundings(queries, points) if first is None else shared(first, len(queries))
+        moved = []
+        for i, layer in enumerate(self.layers):
             if moved and self.config.neighbour_search is NeighbourSearch.EVERY_LAYER:
-                neighbours = self._neighbours(queries, points)
+                surroundings = self._surroundings(queries, points)
             if self.locate is not None:
                 embeddings = embeddings + self.locate(queries)
-            embeddings, queries = layer(embeddings, queries, points, features, neighbours)
+            key = None if dropout_key is None else jax.random.fold_in(dropout_key, i)
+            embeddings, queries = layer(embeddings, queries, features, surroundings, key)
             moved.append(queries)
         return moved[: len(moved) - (self.config.output is DecoderOutput.HAND_PARAMETERS)], embeddings
 
-    def _neighbours(self, queries: Array, points: Array) -> Int[Array, "batch query k"]:
+    def with_first_deltas(self, queries: Float[Array, "1 query 3"], first: Surroundings) -> Surroundings:
+        """Compute beforehand what the first layer needs of queries and neighbours that never move."""
+        vector = self.layers[0].vector_attention
+        if isinstance(vector, VectorAttention):
+            return first._replace(basis=vector.with_deltas(queries, first.basis))
+        assert first.queries is not None
+        return Surroundings(
+            vector.basis.attention.with_deltas(queries, first.basis),
+            vector.queries.attention.with_deltas(queries, first.queries),
+        )
+
+    def _surroundings(self, queries: Array, points: Array) -> Surroundings:
+        k = self.config.num_neighbours
         shared = jnp.broadcast_to(points, (queries.shape[0], *points.shape))
-        return nearest(queries, shared, self.config.num_neighbours)
+        among = self.config.vector_form is VectorForm.QUERIES_THEN_BASIS
+        return Surroundings(
+            nearest_neighbours(queries, shared, k),
+            nearest_neighbours(queries, queries, k) if among else None,
+        )
 
 
 class DecoderLayer(nnx.Module):
-    """Self-attention, cross-attention, vector attention, and a feed-forward network that moves the points."""
+    """Two scalar attentions, vector attention, and what moves the points."""
 
-    def __init__(self, config: DecoderConfig, width: int, *, moves: bool, rngs: nnx.Rngs) -> None:
-        self.basis_stride = config.cross_attention_basis_stride
-        self.self_attention = MultiHeadAttention(width, config.num_heads, rngs=rngs)
-        self.cross_attention = MultiHeadAttention(width, config.num_heads, rngs=rngs)
-        self.vector_attention = VectorAttention(width, rngs=rngs)
-        self.norms = nnx.List(LayerNorm(width) for _ in range(3))
-        self.feed_forward = FeedForward(width, config.ffn_expansion * width, rngs=rngs) if moves else None
+    def __init__(
+        self, config: DecoderConfig, width: int, *, output: DecoderOutput, is_last: bool, rngs: nnx.Rngs
+    ) -> None:
+        self.config = config
+        self.embed = Linear(width, width, rngs=rngs) if config.shared_embedding else None
+        self.self_attention, self.cross_attention = (
+            MultiHeadAttention(width, config.num_heads, dropout_rate=config.dropout, rngs=rngs)
+            for _ in range(2)
+        )
+        basis_alone = config.vector_form is VectorForm.BASIS
+        self.vector_attention = (VectorAttention if basis_alone else QueriesThenBasis)(width, rngs=rngs)
+        self.norms = nnx.List(
+            LayerNorm(width, config.layer_norm_epsilon) for _ in range(3 if basis_alone else 2)
+        )
+        moves, hidden = output is DecoderOutput.OFFSETS, config.ffn_expansion * width
+        if config.coordinate_update is CoordinateUpdate.FEED_FORWARD:
+            self.branch = None
+            self.feed_forward = OffsetNetwork(width, hidden, rngs=rngs) if moves else None
+        else:
+            self.branch = OffsetNetwork(width, width, rngs=rngs) if moves else None
+            # After the last offsets nobody reads the embeddings.
+            unread = is_last and moves
+            self.feed_forward = None if unread else ResidualNetwork(config, width, hidden, rngs=rngs)
 
     def __call__(
         self,
         embeddings: Float[Array, "batch query c"],
         queries: Float[Array, "batch query 3"],
-        points: Float[Array, "basis 3"],
         features: Float[Array, "batch basis c"],
-        neighbours: Int[Array, "batch query k"],
+        surroundings: Surroundings,
+        dropout_key: PRNGKeyArray | None = None,
     ) -> tuple[Float[Array, "batch query c"], Float[Array, "batch query 3"]]:
         """Return the updated embeddings and points."""
-        after_self, after_cross, after_vector = self.norms
-        e = after_self(embeddings + self.self_attention(embeddings, embeddings))
-        e = after_cross(e + self.cross_attention(e, features[:, :: self.basis_stride]))
-        e = after_vector(e + self.vector_attention(e, queries, features, points, neighbours))
-        return e, queries if self.feed_forward is None else queries + self.feed_forward(e)
+        keys = [None] * 5 if dropout_key is None else list(jax.random.split(dropout_key, 5))
+        after_first, after_second = self.norms[0], self.norms[1]
+        e, tokens = self._embedded(embeddings, features, keys[:2])
+        basis = tokens[:, :: self.config.cross_attention_basis_stride]
+        read_first = e if self.config.first_attention is AttentionKeys.QUERIES else basis
+        e = after_first(e + self.self_attention(e, read_first, keys[2]))
+        e = after_second(e + self.cross_attention(e, basis, keys[3]))
+        e = self._read_points(e, queries, tokens, surroundings)
+        return self._moved(e, queries, keys[4])
+
+    def _embedded(self, embeddings: Array, features: Array, keys: list) -> tuple[Array, Array]:
+        if self.embed is None:
+            return embeddings, features
+        rate = self.config.dropout
+        return dropout(self.embed(embeddings), rate, keys[0]), dropout(self.embed(features), rate, keys[1])
+
+    def _read_points(self, e: Array, queries: Array, features: Array, surroundings: Surroundings) -> Array:
+        if isinstance(self.vector_attention, QueriesThenBasis):
+            return self.vector_attention(e, queries, features, surroundings)
+        return self.norms[2](e + self.vector_attention(e, queries, features, surroundings.basis))
+
+    def _moved(self, e: Array, queries: Array, key: PRNGKeyArray | None) -> tuple[Array, Array]:
+        if isinstance(self.feed_forward, OffsetNetwork):
+            return e, queries + self.feed_forward(e)
+        if self.branch is not None:
+            queries = queries + self.branch(e)
+        return e if self.feed_forward is None else self.feed_forward(e, key), queries
 
 
-class FeedForward(nnx.Module):
+class QueriesThenBasis(nnx.Module):
+    """Vector attention among the queries, then to the basis points (release)."""
+
+    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
+        self.queries, self.basis = (BracketedVectorAttention(width, rngs=rngs) for _ in range(2))
+
+    def __call__(
+        self,
+        embeddings: Float[Array, "batch query c"],
+        queries: Float[Array, "batch query 3"],
+        features: Float[Array, "batch basis c"],
+        surroundings: Surroundings,
+    ) -> Float[Array, "batch query c"]:
+        """Return the updated embeddings."""
+        assert surroundings.queries is not None
+        embeddings = self.queries.among_queries(embeddings, queries, surroundings.queries)
+        return self.basis.to_basis(embeddings, queries, features, surroundings.basis)
+
+
+class OffsetNetwork(nnx.Module):
     """Two layers from embedding to offset; zero at first, so that learning starts from the template."""
 
     def __init__(self, width: int, hidden: int, *, rngs: nnx.Rngs) -> None:
@@ -92,6 +221,22 @@ class FeedForward(nnx.Module):
     def __call__(self, embeddings: Float[Array, "batch query c"]) -> Float[Array, "batch query 3"]:
         """Regress offsets."""
         return self.offset(jax.nn.relu(self.hidden(embeddings)))
+
+
+class ResidualNetwork(nnx.Module):
+    """Feed-forward network of the embeddings: LayerNorm(e + W_2 gelu(W_1 e)), with the exact (erf) GELU."""
+
+    def __init__(self, config: DecoderConfig, width: int, hidden: int, *, rngs: nnx.Rngs) -> None:
+        self.dropout_rate = config.dropout
+        self.hidden, self.out = Linear(width, hidden, rngs=rngs), Linear(hidden, width, rngs=rngs)
+        self.norm = LayerNorm(width, config.layer_norm_epsilon)
+
+    def __call__(
+        self, embeddings: Float[Array, "batch query c"], dropout_key: PRNGKeyArray | None = None
+    ) -> Float[Array, "batch query c"]:
+        """Update."""
+        update = self.out(jax.nn.gelu(self.hidden(embeddings), approximate=False))
+        return self.norm(embeddings + dropout(update, self.dropout_rate, dropout_key))
 
 
 class CoordinateEmbedding(nnx.Module):

@@ -8,9 +8,9 @@ from flax import nnx
 from poem_jax.models.batch_norm import NormMode
 from poem_jax.models.config import HRNetConfig
 from poem_jax.models.convolution import ConvNorm
+from poem_jax.models.resampling import repeat_pixels
 from poem_jax.models.residual import BOTTLENECK_EXPANSION, BasicBlock, Bottleneck
 from poem_jax.models.stack import Stack
-from poem_jax.models.upsampling import repeat_pixels
 from poem_jax.typing import Array, Float
 
 

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from poem_jax.typing import Array, Float
+from poem_jax.typing import Array, Float, PRNGKeyArray
 
 Initializer = Callable[..., Array]
 
 xavier_uniform: Initializer = jax.nn.initializers.variance_scaling(1.0, "fan_avg", "uniform")
 zeros: Initializer = jax.nn.initializers.zeros
-_LAYER_NORM_EPSILON = 1e-5
 
 
 class Linear(nnx.Module):
@@ -34,7 +33,8 @@ class Linear(nnx.Module):
 class LayerNorm(nnx.Module):
     """Normalise the last axis (Ba et al. 2016)."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, epsilon: float = 1e-5) -> None:
+        self.epsilon = epsilon
         self.scale = nnx.Param(jnp.ones((channels,)))
         self.bias = nnx.Param(jnp.zeros((channels,)))
 
@@ -42,4 +42,11 @@ class LayerNorm(nnx.Module):
         """Normalise."""
         centred = x - jnp.mean(x, -1, keepdims=True)
         variance = jnp.mean(centred**2, -1, keepdims=True)
-        return centred * jax.lax.rsqrt(variance + _LAYER_NORM_EPSILON) * self.scale[...] + self.bias[...]
+        return centred * jax.lax.rsqrt(variance + self.epsilon) * self.scale[...] + self.bias[...]
+
+
+def dropout(x: Float[Array, "*shape"], rate: float, key: PRNGKeyArray | None) -> Float[Array, "*shape"]:
+    """Set a share of the numbers to zero and enlarge the rest in proportion; without a key, do nothing."""
+    if key is None or rate == 0:
+        return x
+    return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0)

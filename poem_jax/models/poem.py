@@ -10,23 +10,14 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.batch import Prediction
-from poem_jax.geometry.cameras import Cameras, anchor_to_primary, fill_masked_views
-from poem_jax.geometry.transforms import (
-    axis_angle_from_rotation,
-    invert_rigid,
-    matmul,
-    transform_points,
-)
-from poem_jax.hand.model import HandModel
-from poem_jax.hand.topology import NUM_JOINTS, WRIST, split_vertices_first
+from poem_jax.geometry.cameras import Cameras, fill_masked_views
 from poem_jax.models import parameters
 from poem_jax.models.batch_norm import NormMode
 from poem_jax.models.checks import check_inputs
 from poem_jax.models.config import Config
 from poem_jax.models.far_world import Origin, centre_world, move_back
-from poem_jax.models.parametric import HandParameters
 from poem_jax.models.presets import V2_BASE, preset
-from poem_jax.models.reconstruction import Reconstruction
+from poem_jax.models.primary_frame import enter_primary_frame, leave_primary_frame
 from poem_jax.typing import Array, Bool, Float, Num, Params, PRNGKeyArray
 
 __all__ = ["apply", "forward", "init", "preset"]
@@ -119,27 +110,27 @@ def forward(
         config: the configuration that `params` were made with.
         root_world: as in `apply`, in training the noisy true root; NaN rows are triangulated.
         train: normalise by the moments of this batch's valid views and move the running statistics.
-        key: reserved for random layers; the present ones draw nothing.
+        key: in training, what dropout draws from; None = nothing is dropped.
         axis_name: device axis over which the moments are averaged.
 
     Returns: the prediction, and the new `params["statistics"]` (unchanged unless `train`).
     """
-    del key
     dtype = params["constants"]["basis_points"].dtype
-    images, cams, whole = _sound_inputs(_normalised_images(views, config, dtype), _cast(cams, dtype))
-    T_cam_from_primary, T_primary_from_world = anchor_to_primary(cams.T_cam_from_world, cams.view_mask)
-    root = None if root_world is None else _move_root(T_primary_from_world, jnp.asarray(root_world, dtype))
+    images, cams, whole = _sound_inputs(normalised_images(views, config, dtype), _cast(cams, dtype))
+    frame = enter_primary_frame(cams, root_world)
     model = parameters.assemble(config, params)
-    image_mask = cams.view_mask.reshape(-1) if train else None
-    result = model(
-        images, cams._replace(T_cam_from_world=T_cam_from_primary), root, NormMode(image_mask, axis_name)
-    )
+    mode = NormMode(cams.view_mask.reshape(-1) if train else None, axis_name)
+    result = model(images, frame.cams, frame.root, mode, key if train else None)
     result = result._replace(valid=result.valid & whole)
-    prediction = _to_world(result, invert_rigid(T_primary_from_world), model.hand.model())
+    hand, order = model.hand.model(), config.decoder.query_order
+    prediction = leave_primary_frame(result, frame.T_world_from_primary, hand, order)
     return prediction, parameters.statistics(model) if train else params["statistics"]
 
 
-def _normalised_images(views: Array, config: Config, dtype: jnp.dtype) -> Float[Array, "batch view h w 3"]:
+def normalised_images(
+    views: Num[Array, "*batch h w 3"], config: Config, dtype: jnp.dtype
+) -> Float[Array, "*batch h w 3"]:
+    """Return images as a model takes them: (value in [0, 1] - mean) / std."""
     scale = 255.0 if views.dtype == jnp.uint8 else 1.0
     return (jnp.asarray(views, dtype) / scale - config.image_mean) / config.image_std
 
@@ -161,54 +152,3 @@ def _sound_inputs(
 
 def _finite_per_view(values: Float[Array, "batch view *rest"]) -> Bool[Array, "batch view"]:
     return jnp.all(jnp.isfinite(values), tuple(range(2, values.ndim)))
-
-
-def _move_root(
-    T_a_from_b: Float[Array, "batch 4 4"], root_b: Float[Array, "batch 3"]
-) -> Float[Array, "batch 3"]:
-    """Move known roots; unknown ones stay NaN, without letting NaN into gradients."""
-    known = jnp.all(jnp.isfinite(root_b), -1, keepdims=True)
-    return jnp.where(known, _move(T_a_from_b, jnp.where(known, root_b, 0)), jnp.nan)
-
-
-def _move(
-    T_a_from_b: Float[Array, "batch 4 4"], points_b: Float[Array, "batch 3"]
-) -> Float[Array, "batch 3"]:
-    return transform_points(T_a_from_b, points_b[:, None])[:, 0]
-
-
-def _to_world(
-    result: Reconstruction, T_world_from_primary: Float[Array, "batch 4 4"], hand: HandModel
-) -> Prediction:
-    layers_world = transform_points(T_world_from_primary, result.layers)
-    vertices_world, joints_world = split_vertices_first(layers_world[-1])
-    has_all_joints = result.reference_joints.shape[1] == NUM_JOINTS
-    prediction = Prediction(
-        vertices_world=vertices_world,
-        joints_world=joints_world,
-        root_world=_move(T_world_from_primary, result.root),
-        keypoints_px=result.keypoints_px,
-        heat_maps=result.heat_maps,
-        layers_world=layers_world,
-        valid=result.valid,
-        reference_joints_world=(
-            transform_points(T_world_from_primary, result.reference_joints) if has_all_joints else None
-        ),
-    )
-    if result.parameters is None:
-        return prediction
-    return _with_parameters(prediction, result.parameters, T_world_from_primary, hand)
-
-
-def _with_parameters(
-    prediction: Prediction, parameters: HandParameters, T_world_from_primary: Array, hand: HandModel
-) -> Prediction:
-    """Add pose, shape and translation: `hand_mesh` of them gives the vertices in the world."""
-    turned = matmul(T_world_from_primary[:, :3, :3], parameters.rotations[:, 0])
-    rotations = jnp.concatenate([turned[:, None], parameters.rotations[:, 1:]], 1)
-    resting_wrist = hand.shape(parameters.shape).skeleton[:, WRIST]
-    return prediction._replace(
-        pose=axis_angle_from_rotation(rotations),
-        shape=parameters.shape,
-        translation=prediction.joints_world[:, WRIST] - resting_wrist,
-    )

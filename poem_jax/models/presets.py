@@ -1,20 +1,36 @@
-"""The named models: `v2-small`, `v2-base`, `v2-large`, `v2-param` of the paper, and `tiny` for a CPU."""
+"""The named models.
+
+`v2-small`, `v2-base`, `v2-large`, `v2-param` are the paper's; `v2-small-release`, `v2-medium-release`,
+`v2-large-release`, `v2-medium-mano-release` those that the authors released, for their weights; `tiny` is
+ours, for a CPU.
+"""
 
 from dataclasses import replace
 
-from poem_jax.hand.topology import NUM_JOINTS
+from poem_jax.hand.topology import NUM_JOINTS, QueryOrder
 from poem_jax.models.config import (
+    AggregationConfig,
+    AttentionKeys,
     BasisConfig,
+    BehindCamera,
     Config,
+    CoordinateUpdate,
     DecoderConfig,
     DecoderOutput,
+    FeatureConfig,
+    FeatureFusion,
+    FirstNeighbours,
     HeatActivation,
+    Layout,
     NeighbourSearch,
+    PositionCode,
     QueryStart,
     ResNetConfig,
     RootConfig,
     Similarity,
+    SingleView,
     Stem,
+    VectorForm,
     ViewWeights,
 )
 
@@ -22,6 +38,33 @@ V2_BASE = Config()
 V2_SMALL = replace(V2_BASE, width=128)
 V2_LARGE = replace(V2_BASE, width=512)
 V2_PARAM = replace(V2_BASE, decoder=DecoderConfig(output=DecoderOutput.HAND_PARAMETERS))
+
+V2_MEDIUM_RELEASE = Config(
+    branch_bias=True,
+    root=RootConfig(num_joints=NUM_JOINTS, pooling=2, cell_offset=0.0, unit_rows=False),
+    features=FeatureConfig(
+        stride=16, fusion=FeatureFusion.BOTTOM_UP, position_code=PositionCode.VIEW_ROW_COLUMN
+    ),
+    basis=BasisConfig(behind_camera=BehindCamera.MIRRORED),
+    aggregation=AggregationConfig(layout=Layout.ROW_MAJOR, single_view=SingleView.RESIDUAL, narrow_phi=True),
+    decoder=DecoderConfig(
+        query_order=QueryOrder.JOINTS_FIRST,
+        first_attention=AttentionKeys.BASIS,
+        vector_form=VectorForm.QUERIES_THEN_BASIS,
+        first_neighbours=FirstNeighbours.ANCHORS,
+        coordinate_update=CoordinateUpdate.BRANCH_BEFORE,
+        shared_embedding=True,
+        layer_norm_epsilon=1e-12,
+        dropout=0.1,
+        pooling=Layout.ROW_MAJOR,
+    ),
+)
+V2_SMALL_RELEASE = replace(V2_MEDIUM_RELEASE, width=128)
+V2_LARGE_RELEASE = replace(V2_MEDIUM_RELEASE, width=512)
+V2_MEDIUM_MANO_RELEASE = replace(
+    V2_MEDIUM_RELEASE,
+    decoder=replace(V2_MEDIUM_RELEASE.decoder, output=DecoderOutput.HAND_PARAMETERS),
+)
 
 TINY = Config(
     image_hw=(128, 128),
@@ -39,7 +82,7 @@ TINY = Config(
         view_weights=ViewWeights.HEAT_SPREAD,
     ),
     basis=BasisConfig(num_points=1024),
-    similarity=Similarity.MEAN,
+    aggregation=AggregationConfig(similarity=Similarity.MEAN),
     decoder=DecoderConfig(
         num_layers=2,
         num_neighbours=8,
@@ -56,6 +99,10 @@ PRESETS = {
     "v2-base": V2_BASE,
     "v2-large": V2_LARGE,
     "v2-param": V2_PARAM,
+    "v2-small-release": V2_SMALL_RELEASE,
+    "v2-medium-release": V2_MEDIUM_RELEASE,
+    "v2-large-release": V2_LARGE_RELEASE,
+    "v2-medium-mano-release": V2_MEDIUM_MANO_RELEASE,
     "tiny": TINY,
 }
 

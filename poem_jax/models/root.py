@@ -9,15 +9,19 @@ from poem_jax.models.batch_norm import NormMode
 from poem_jax.models.config import HeatActivation, HRNetConfig, ResNetConfig, RootConfig
 from poem_jax.models.convolution import Conv
 from poem_jax.models.pyramid import TopDownBranch
+from poem_jax.models.resampling import max_pool
 from poem_jax.typing import Array, Float
 
 
 class HeatMapBranch(nnx.Module):
     """Heat maps of the joints and their expectation in pixels."""
 
-    def __init__(self, config: RootConfig, trunk: HRNetConfig | ResNetConfig, *, rngs: nnx.Rngs) -> None:
-        self.stride = config.stride
-        self.branch = TopDownBranch(trunk.channels, trunk.strides, config.stride, rngs=rngs)
+    def __init__(
+        self, config: RootConfig, trunk: HRNetConfig | ResNetConfig, *, bias: bool = False, rngs: nnx.Rngs
+    ) -> None:
+        self.stride, self.cell_offset = config.stride, config.cell_offset
+        self.pooling = config.pooling
+        self.branch = TopDownBranch(trunk.channels, trunk.strides, config.branch_stride, bias=bias, rngs=rngs)
         self.to_logits = Conv(self.branch.c_out, config.num_joints, 1, bias=True, rngs=rngs)
         self.activation = config.activation
 
@@ -25,13 +29,15 @@ class HeatMapBranch(nnx.Module):
         self, levels: tuple[Array, ...], mode: NormMode
     ) -> tuple[Float[Array, "image joint 2"], Float[Array, "image joint h w"]]:
         """Return joint positions in pixels, the expectation (paper, eq. 3) of the heat maps, and the maps."""
-        logits = jnp.moveaxis(self.to_logits(self.branch(levels, mode)), -1, -3)
+        logits = jnp.moveaxis(self.to_logits(max_pool(self.branch(levels, mode), self.pooling)), -1, -3)
         if self.activation is HeatActivation.SOFTMAX:
             heat = jax.nn.softmax(logits, axis=(-2, -1))
         else:
-            # Of logarithms, so that a map of very low logits is not 0 / 0.
+            # Of logarithms, so that a map of very low logits is not 0 / 0. The release adds 1e-6 to the sum,
+            # which is below float32's resolution for any map that sees something.
             heat = jax.nn.softmax(jax.nn.log_sigmoid(logits), axis=(-2, -1))
-        return self.stride * soft_argmax(heat), heat
+        # `soft_argmax` takes a cell's centre for its position.
+        return self.stride * (soft_argmax(heat) + (self.cell_offset - 0.5)), heat
 
 
 def spread(heat_maps: Float[Array, "*batch h w"]) -> Float[Array, "*batch"]:

@@ -1,7 +1,7 @@
-"""Vector attention of query points over their nearest basis points (paper, eq. 11; Zhao et al. 2021).
+"""Vector attention of query points over neighbouring points (paper, eq. 11; Zhao et al. 2021).
 
     E_i <- sum_j softmax_j(gamma(alpha(E_i) - beta(F_j) + delta_ij)) * (psi(F_j) + delta_ij),
-    delta_ij = xi(X_i - P_j), j over the k nearest basis points; softmax and product per channel.
+    delta_ij = xi(X_i - P_j), j over the neighbours of i; softmax and product per channel.
 
 gamma and xi are two-layer networks. Their linear parts commute with the gather, so with G = gamma_1 and
 h_ij = relu(xi_1(X_i - P_j)) what is linear is applied to points before gathering, and G xi_2 is one matrix:
@@ -12,76 +12,155 @@ The neighbours are visited in a loop, each visit recomputed in the backward pass
 array is kept.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from poem_jax.geometry.neighbours import nearest
 from poem_jax.models.linear import Linear
 from poem_jax.typing import Array, Float, Int
 
 _MAX_LOGIT = 60.0
-"""Logits are taken relative to those of the nearest neighbour; exp(60) is far from overflow in float32."""
+"""Logits are taken relative to those of the first neighbour; exp(60) is far from overflow in float32."""
+
+
+class Deltas(NamedTuple):
+    """What the offsets to the neighbours contribute: G xi_2 h_ij and xi_2 h_ij."""
+
+    inside: Float[Array, "k batch query c"]
+    values: Float[Array, "k batch query c"]
+
+
+class Neighbours(NamedTuple):
+    """Which rows of a point cloud each query reads, and where these stand; neighbours first, for a loop."""
+
+    index: Int[Array, "k batch query"]
+    """A query axis of 1 stands for all queries."""
+    positions: Float[Array, "k #batch #query 3"]
+    deltas: Deltas | None = None
+    """Computed beforehand where queries and neighbours never move."""
+
+
+def nearest_neighbours(
+    queries: Float[Array, "batch query 3"], points: Float[Array, "batch point 3"], k: int
+) -> Neighbours:
+    """Find the `k` points nearest to each query; the search has no derivative, the positions have."""
+    index = jnp.moveaxis(nearest(queries, points, k), -1, 0)
+    return Neighbours(index, jax.vmap(_rows, (None, 0))(points, index))
+
+
+def anchored(index: Int[Array, " k"], positions: Float[Array, "k 3"]) -> Neighbours:
+    """Let every query read the same rows, which count as standing at `positions` (batch 1)."""
+    return Neighbours(jnp.asarray(index)[:, None, None], jnp.asarray(positions)[:, None, None])
 
 
 class VectorAttention(nnx.Module):
     """The five embedding networks alpha, beta, gamma, psi, xi."""
 
-    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, width: int, *, like_release: bool = False, rngs: nnx.Rngs) -> None:
+        """`like_release`: logits are divided by the root of the width, and gamma's last layer has a bias,
+        which cannot change anything: it is constant over the softmax's axis."""
         self.alpha, self.beta, self.psi = (Linear(width, width, bias=False, rngs=rngs) for _ in range(3))
         self.gamma_in = Linear(width, width, rngs=rngs)
-        # No bias: a constant over the softmax's axis has no effect.
-        self.gamma_out = Linear(width, width, bias=False, rngs=rngs)
+        self.gamma_out = Linear(width, width, bias=like_release, rngs=rngs)
         self.xi_in, self.xi_out = Linear(3, width, rngs=rngs), Linear(width, width, rngs=rngs)
+        self.logit_scale = width**-0.5 if like_release else 1.0
 
     def __call__(
         self,
         embeddings: Float[Array, "batch query c"],
         queries: Float[Array, "batch query 3"],
-        features: Float[Array, "batch basis c"],
-        points: Float[Array, "basis 3"],
-        neighbours: Int[Array, "batch query k"],
+        features: Float[Array, "batch point c"],
+        neighbours: Neighbours,
     ) -> Float[Array, "batch query c"]:
         """Read the neighbours' features; coordinates in units of the basis radius."""
-        gamma = self.gamma_in.kernel[...]
         per_query = self.gamma_in(self.alpha(embeddings) + self.xi_out.bias[...])
-        per_point = features @ jnp.concatenate([self.beta.kernel[...] @ gamma, self.psi.kernel[...]], -1)
-        from_offset = jnp.concatenate([self.xi_out.kernel[...] @ gamma, self.xi_out.kernel[...]], -1)
+        beta, psi = features @ (self.beta.kernel[...] @ self.gamma_in.kernel[...]), self.psi(features)
+        to_logits, delta = self.gamma_out.kernel[...] * self.logit_scale, self._delta()
 
-        def visit(index: Int[Array, "batch query"]) -> tuple[Array, Array]:
+        def visit(neighbour: Neighbours) -> tuple[Array, Array]:
             """Return the logits and the values of one neighbour of every query."""
-            beta, psi = jnp.split(_rows(per_point, index), 2, -1)
-            offset = queries - jnp.asarray(points)[index]
-            delta_in, delta = jnp.split(jax.nn.relu(self.xi_in(offset)) @ from_offset, 2, -1)
-            logits = self.gamma_out(jax.nn.relu(per_query - beta + delta_in))
-            return logits, psi + delta
+            known = neighbour.deltas
+            added, value = delta(queries, neighbour.positions) if known is None else known
+            inside = per_query - _rows(beta, neighbour.index) + added
+            return jax.nn.relu(inside) @ to_logits, _rows(psi, neighbour.index) + value
 
-        values = _softmax_sum(visit, jnp.moveaxis(neighbours, -1, 0))
-        return values + self.xi_out.bias[...]
+        return _softmax_sum(visit, neighbours) + self.xi_out.bias[...]
+
+    def with_deltas(self, queries: Float[Array, "batch query 3"], neighbours: Neighbours) -> Neighbours:
+        """Compute beforehand what depends on nothing but the positions."""
+        delta = self._delta()
+        deltas = jax.lax.map(lambda positions: delta(queries, positions), neighbours.positions)
+        return neighbours._replace(deltas=deltas)
+
+    def _delta(self) -> Callable[[Array, Array], Deltas]:
+        """Return the function from queries and the positions of one neighbour each to `Deltas`."""
+        xi_out = self.xi_out.kernel[...]
+        to_inside = xi_out @ self.gamma_in.kernel[...]
+
+        def delta(queries: Array, positions: Array) -> Deltas:
+            hidden = jax.nn.relu(self.xi_in(queries - positions))
+            return Deltas(hidden @ to_inside, hidden @ xi_out)
+
+        return delta
+
+
+class BracketedVectorAttention(nnx.Module):
+    """Vector attention between two linear maps, with a residual sum (release)."""
+
+    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
+        self.before, self.after = Linear(width, width, rngs=rngs), Linear(width, width, rngs=rngs)
+        self.attention = VectorAttention(width, like_release=True, rngs=rngs)
+
+    def among_queries(
+        self,
+        embeddings: Float[Array, "batch query c"],
+        queries: Float[Array, "batch query 3"],
+        neighbours: Neighbours,
+    ) -> Float[Array, "batch query c"]:
+        """Let the queries read each other."""
+        mapped = self.before(embeddings)
+        return embeddings + self.after(self.attention(mapped, queries, mapped, neighbours))
+
+    def to_basis(
+        self,
+        embeddings: Float[Array, "batch query c"],
+        queries: Float[Array, "batch query 3"],
+        features: Float[Array, "batch basis c"],
+        neighbours: Neighbours,
+    ) -> Float[Array, "batch query c"]:
+        """Let the queries read basis points; only these pass the first map."""
+        read = self.attention(embeddings, queries, self.before(features), neighbours)
+        return embeddings + self.after(read)
 
 
 def _rows(
-    table: Float[Array, "batch basis c"], index: Int[Array, "batch query"]
+    table: Float[Array, "batch point c"], index: Int[Array, "batch query"]
 ) -> Float[Array, "batch query c"]:
     return jax.vmap(lambda rows, i: rows.at[i].get(mode="promise_in_bounds"))(table, index)
 
 
-def _softmax_sum(visit, indices: Int[Array, "k batch query"]) -> Float[Array, "batch query c"]:
+def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]:
     """Return sum_j softmax_j(logits) * values over the visits.
 
-    A softmax may be taken relative to any reference; the nearest neighbour's logits serve, so that the sums
-    need no first pass for a maximum and the denominator is at least 1.
+    A softmax may be taken relative to any reference; the first (nearest) neighbour's logits serve, so that
+    the sums need no first pass for a maximum and the denominator is at least 1.
     """
-    reference = jax.lax.stop_gradient(visit(indices[0])[0])
+    first = jax.tree.map(lambda leaf: leaf[0], neighbours)
+    reference = jax.lax.stop_gradient(visit(first)[0])
 
     @jax.checkpoint  # pyright: ignore[reportPrivateImportUsage]
-    def weighted(index: Array) -> tuple[Array, Array]:
-        logits, values = visit(index)
+    def weighted(neighbour: Neighbours) -> tuple[Array, Array]:
+        logits, values = visit(neighbour)
         weight = jnp.exp(jnp.minimum(logits - reference, _MAX_LOGIT))
         return weight, weight * values
 
-    def add(sums: tuple[Array, Array], index: Array) -> tuple[tuple[Array, Array], None]:
-        return jax.tree.map(jnp.add, sums, weighted(index)), None
+    def add(sums: tuple[Array, Array], neighbour: Neighbours) -> tuple[tuple[Array, Array], None]:
+        return jax.tree.map(jnp.add, sums, weighted(neighbour)), None
 
     zero = jnp.zeros_like(reference)
-    (denominator, numerator), _ = jax.lax.scan(add, (zero, zero), indices)
+    (denominator, numerator), _ = jax.lax.scan(add, (zero, zero), neighbours)
     return numerator / denominator

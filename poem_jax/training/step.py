@@ -89,6 +89,7 @@ def train_step(
                 hand=hand,
                 image_hw=image_hw,
                 recipe=config.loss,
+                query_order=config.model.decoder.query_order,
                 axis_name=axis_name,
             )
             errors = error_metrics(prediction, batch, axis_name=axis_name)

@@ -17,7 +17,8 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.seal import check_seal, write_seal
-from poem_jax.models.config import Config, from_json, to_json
+from poem_jax.models.config import Config
+from poem_jax.models.config_json import from_json, to_json
 from poem_jax.models.parameters import describe
 from poem_jax.typing import Array, Params, PyTree
 

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from poem_jax.geometry.cameras import Cameras
+from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
-from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.models.basis import basis_points
 from poem_jax.models.config import (
+    AggregationConfig,
     BasisConfig,
     Config,
     DecoderConfig,
     DecoderOutput,
+    FirstNeighbours,
     HRNetConfig,
     QueryStart,
     ResNetConfig,
@@ -25,6 +27,7 @@ from poem_jax.models.config import (
     Stem,
 )
 from poem_jax.models.parameters import describe
+from poem_jax.models.reconstruction import template_queries
 
 _MICRO = Config(
     image_hw=(32, 32),
@@ -33,7 +36,7 @@ _MICRO = Config(
         blocks=(1, 1), channels=(8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
     ),
     basis=BasisConfig(num_points=64),
-    similarity=Similarity.MEAN,
+    aggregation=AggregationConfig(similarity=Similarity.MEAN),
     decoder=DecoderConfig(num_layers=2, num_neighbours=4, ffn_expansion=1),
 )
 
@@ -57,12 +60,16 @@ def drawn(config: Config, seed: int = 0) -> dict:
 @functools.cache
 def constants(config: Config) -> dict:
     hand = default_hand()
-    rest = hand_mesh(hand, np.zeros((16, 3), np.float32), np.zeros(10, np.float32), center_joint=9)
-    return {
+    template = template_queries(hand, config.decoder.query_order)
+    made = {
         "basis_points": basis_points(config.basis),
-        "template_queries": np.concatenate(rest),
+        "template_queries": template,
         "hand": hand._asdict(),
     }
+    if config.decoder.first_neighbours is FirstNeighbours.ANCHORS:
+        index = farthest_points(template, config.decoder.num_neighbours)
+        made["anchors"] = {"index": index, "positions": template[index] / np.float32(config.basis.radius)}
+    return made
 
 
 @pytest.fixture(scope="session")

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from poem_jax.models.aggregation import ProjectiveAggregation
-from poem_jax.models.config import Similarity
+from poem_jax.models.aggregation import ProjectiveAggregation, row_major_tokens
+from poem_jax.models.config import AggregationConfig, Layout, Similarity, SingleView
 
 BATCH, VIEWS, POINTS, WIDTH = 3, 4, 5, 8
 FEATURES = np.random.default_rng(0).normal(size=(BATCH, VIEWS, POINTS, WIDTH)).astype(np.float32)
@@ -14,7 +14,7 @@ PRIMARY = np.array([0, 1, 2])
 
 @pytest.fixture(params=list(Similarity))
 def module(request):
-    return ProjectiveAggregation(WIDTH, request.param, rngs=nnx.Rngs(0))
+    return ProjectiveAggregation(AggregationConfig(similarity=request.param), WIDTH, rngs=nnx.Rngs(0))
 
 
 def _naive(module, features, mask, primary):
@@ -64,3 +64,33 @@ def test_permuted_points_permute_their_features(module):
     order = np.random.default_rng(1).permutation(POINTS)
     permuted = module(jnp.asarray(FEATURES)[:, :, order], MASK, PRIMARY)
     np.testing.assert_allclose(permuted, module(FEATURES, MASK, PRIMARY)[:, order], atol=1e-6)
+
+
+def test_row_major_tokens_read_the_memory_of_the_valid_views():
+    """As the released code reshapes it: (N, C, S) contiguous, taken for (S, N, C)."""
+    count = np.array([4, 2, 3])
+    tokens = np.asarray(row_major_tokens(jnp.asarray(FEATURES), jnp.asarray(count)))
+    for sample, n in enumerate(count):
+        memory = np.ascontiguousarray(FEATURES[sample, :n].transpose(0, 2, 1))
+        expected = memory.reshape(POINTS, n, WIDTH)
+        np.testing.assert_array_equal(tokens[sample, :n].transpose(1, 0, 2), expected)
+
+
+def test_one_view_gets_the_residual_of_the_release():
+    config = AggregationConfig(single_view=SingleView.RESIDUAL, narrow_phi=True)
+    module = ProjectiveAggregation(config, WIDTH, rngs=nnx.Rngs(0))
+    assert module.phi_in.kernel.shape == (WIDTH // 2, WIDTH // 2)
+    f1 = FEATURES[2, 2]
+    theta = module.theta_out(np.maximum(module.theta_in(f1), 0))
+    expected = f1 + module.phi_out(np.maximum(module.phi_in(theta), 0))
+    np.testing.assert_allclose(module(FEATURES, MASK, PRIMARY)[2], expected, atol=1e-6)
+
+
+def test_masked_views_do_not_matter_to_the_row_major_layout():
+    config = AggregationConfig(layout=Layout.ROW_MAJOR, single_view=SingleView.RESIDUAL)
+    module = ProjectiveAggregation(config, WIDTH, rngs=nnx.Rngs(0))
+    mask = np.array([[True] * 4, [True, True, False, False], [True, False, False, False]])
+    found = module(FEATURES, mask, np.zeros(3, int))
+    for sample, n in enumerate((4, 2, 1)):
+        alone = module(FEATURES[sample : sample + 1, :n], np.ones((1, n), bool), np.zeros(1, int))
+        np.testing.assert_allclose(found[sample : sample + 1], alone, atol=1e-6)

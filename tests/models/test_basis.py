@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from poem_jax.geometry.cameras import Cameras
-from poem_jax.models.basis import basis_points, projected_features, sine_code
-from poem_jax.models.config import BasisConfig, BasisSampling
+from poem_jax.models.basis import basis_points, projected_features
+from poem_jax.models.config import BasisConfig, BasisSampling, BehindCamera
 
 
 @pytest.mark.parametrize(("sampling", "mean_radius"), [("ball", 0.075), ("gaussian", 0.0655)])
@@ -23,18 +23,6 @@ def test_points_are_fixed_by_their_seed():
     assert not np.allclose(basis_points(BasisConfig()), basis_points(BasisConfig(seed=1)))
 
 
-def test_sine_code_is_the_written_formula():
-    width, uv = 16, np.array([[0.25, 0.75], [-0.5, 1.5]], np.float32)
-    expected = np.zeros((2, width))
-    for n, (u, v) in enumerate(uv):
-        for axis, share in enumerate((v, u)):
-            for i in range(width // 4):
-                angle = 2 * np.pi * share / 10000 ** (2 * i / (width // 2))
-                expected[n, axis * width // 2 + 2 * i] = np.sin(angle)
-                expected[n, axis * width // 2 + 2 * i + 1] = np.cos(angle)
-    np.testing.assert_allclose(sine_code(jnp.asarray(uv), width), expected, atol=1e-6)
-
-
 @pytest.fixture
 def ramp():
     """A 32 x 32 image's stride-8 map whose channels hold its cell centres' pixels."""
@@ -50,12 +38,24 @@ def test_features_are_read_where_points_project(ramp):
     maps, cams = ramp
     points = np.array([[[0.05, -0.03, 0.5], [0.0, 0.0, 0.4]]], np.float32)
     uv = 40 * points[..., :2] / points[..., 2:] + 16
-    features = projected_features(maps, cams, points, (32, 32)) - sine_code(jnp.asarray(uv / 32), 8)[:, None]
+    features, share = projected_features(maps, cams, points, (32, 32))
     np.testing.assert_allclose(features[0, 0, :, :2], uv[0], atol=1e-4)
+    np.testing.assert_allclose(share[0, 0], uv[0] / 32, atol=1e-6)
 
 
 def test_points_behind_the_camera_read_nothing(ramp):
     maps, cams = ramp
     points = np.array([[[0.0, 0.0, -0.5]]], np.float32)
-    features = projected_features(maps, cams, points, (32, 32))
-    np.testing.assert_allclose(features[0, 0, 0], sine_code(jnp.zeros(2), 8), atol=1e-6)
+    features, share = projected_features(maps, cams, points, (32, 32))
+    assert not np.any(features)
+    assert not np.any(share)
+
+
+def test_the_release_reads_through_the_camera(ramp):
+    """A point behind the camera reads what its mirror image in front reads."""
+    maps, cams = ramp
+    points = np.array([[[0.05, -0.03, 0.5]]], np.float32)
+    front, _ = projected_features(maps, cams, points, (32, 32), BehindCamera.MIRRORED)
+    back, _ = projected_features(maps, cams, -points, (32, 32), BehindCamera.MIRRORED)
+    assert np.any(front)
+    np.testing.assert_allclose(front, back, atol=1e-4)

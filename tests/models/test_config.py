@@ -7,13 +7,13 @@ from poem_jax.models.config import (
     BasisConfig,
     Config,
     DecoderConfig,
+    FeatureConfig,
     HRNetConfig,
     QueryStart,
     ResNetConfig,
     RootConfig,
-    from_json,
-    to_json,
 )
+from poem_jax.models.config_json import from_json, to_json
 from poem_jax.models.presets import PRESETS, preset
 
 
@@ -45,7 +45,7 @@ def test_unknown_trunk_fails():
 
 def test_unknown_choice_fails():
     text = json.loads(to_json(preset("tiny")))
-    text["similarity"] = "cosine"
+    text["aggregation"]["similarity"] = "cosine"
     with pytest.raises(ValueError, match="'cosine' is not a valid Similarity"):
         from_json(json.dumps(text))
 
@@ -92,7 +92,7 @@ def test_a_whole_number_is_a_good_float():
         (lambda: ResNetConfig(blocks=(1, 0), channels=(8, 8)), "`blocks` must be whole"),
         (lambda: HRNetConfig(width=0), "`width` must be whole"),
         (lambda: Config(image_hw=(250, 256)), "`image_hw` must be multiples"),
-        (lambda: Config(feature_stride=7), "`feature_stride` must be one of"),
+        (lambda: Config(features=FeatureConfig(stride=7)), "`features.stride` must be one of"),
         (lambda: Config(root=RootConfig(stride=3)), "`root.stride` must be one of"),
         (lambda: Config(width=100), "`width` must be a multiple"),
         (lambda: Config(basis=BasisConfig(num_points=16)), "`num_neighbours` must not exceed"),

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from poem_jax.models.vector_attention import VectorAttention
+from poem_jax.models.vector_attention import (
+    BracketedVectorAttention,
+    Neighbours,
+    VectorAttention,
+    anchored,
+    nearest_neighbours,
+)
 
 RNG = np.random.default_rng(0)
 BATCH, QUERIES, POINTS, K, WIDTH = 2, 6, 9, 3, 8
@@ -14,6 +20,12 @@ FEATURES = RNG.normal(size=(BATCH, POINTS, WIDTH)).astype(np.float32)
 BASIS = RNG.normal(size=(POINTS, 3)).astype(np.float32)
 NEIGHBOURS = np.stack([RNG.permutation(POINTS)[:K] for _ in range(BATCH * QUERIES)])
 NEIGHBOURS = NEIGHBOURS.reshape(BATCH, QUERIES, K).astype(np.int32)
+
+
+def _of(index, points=BASIS) -> Neighbours:
+    """The neighbours (batch, query, k) of points that all samples share."""
+    index = np.moveaxis(index, -1, 0)
+    return Neighbours(jnp.asarray(index), jnp.asarray(points)[index])
 
 
 @pytest.fixture
@@ -45,19 +57,19 @@ def _naive(m, embeddings, positions, features):
 
 
 def test_equation_11(module):
-    found = module(EMBEDDINGS, POSITIONS, FEATURES, BASIS, NEIGHBOURS)
+    found = module(EMBEDDINGS, POSITIONS, FEATURES, _of(NEIGHBOURS))
     np.testing.assert_allclose(found, _naive(module, EMBEDDINGS, POSITIONS, FEATURES), atol=1e-4)
 
 
 def test_order_of_neighbours_does_not_matter(module):
-    found = module(EMBEDDINGS, POSITIONS, FEATURES, BASIS, NEIGHBOURS)
-    turned = module(EMBEDDINGS, POSITIONS, FEATURES, BASIS, NEIGHBOURS[..., ::-1])
+    found = module(EMBEDDINGS, POSITIONS, FEATURES, _of(NEIGHBOURS))
+    turned = module(EMBEDDINGS, POSITIONS, FEATURES, _of(NEIGHBOURS[..., ::-1]))
     np.testing.assert_allclose(found, turned, atol=1e-5)
 
 
 def test_extreme_logits_stay_finite(module):
     module.gamma_out.kernel[...] *= 1e4
-    run = jax.value_and_grad(lambda e: jnp.sum(module(e, POSITIONS, FEATURES, BASIS, NEIGHBOURS) ** 2))
+    run = jax.value_and_grad(lambda e: jnp.sum(module(e, POSITIONS, FEATURES, _of(NEIGHBOURS)) ** 2))
     value, gradient = run(jnp.asarray(EMBEDDINGS))
     assert np.isfinite(value)
     assert np.isfinite(gradient).all()
@@ -70,7 +82,7 @@ def test_gradients_match_finite_differences():
         state = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), state)
 
         def total(embeddings, positions, features):
-            read = nnx.merge(graph, state)(embeddings, positions, features, BASIS, NEIGHBOURS)
+            read = nnx.merge(graph, state)(embeddings, positions, features, _of(NEIGHBOURS))
             return jnp.sum(jnp.sin(read))
 
         inputs = [jnp.asarray(x, jnp.float64) for x in (EMBEDDINGS, POSITIONS, FEATURES)]
@@ -80,3 +92,50 @@ def test_gradients_match_finite_differences():
             plus, minus = ([*inputs[:n], x + sign * step, *inputs[n + 1 :]] for sign in (1, -1))
             difference = (total(*plus) - total(*minus)) / 2
             np.testing.assert_allclose(difference, jnp.sum(gradient * step), rtol=5e-4)
+
+
+def test_nearest_neighbours_stand_where_their_points_are():
+    points = RNG.normal(size=(BATCH, POINTS, 3)).astype(np.float32)
+    found = nearest_neighbours(POSITIONS, points, K)
+    distance = np.linalg.norm(POSITIONS[:, :, None] - points[:, None], axis=-1)
+    expected = np.argsort(distance, -1)[..., :K]
+    np.testing.assert_array_equal(np.moveaxis(found.index, 0, -1), expected)
+    for b in range(BATCH):
+        np.testing.assert_array_equal(np.moveaxis(found.positions, 0, 2)[b], points[b][expected[b]])
+
+
+def test_anchors_are_neighbours_of_every_query(module):
+    index, places = np.array([4, 0, 7]), RNG.normal(size=(3, 3)).astype(np.float32)
+    everywhere = Neighbours(
+        jnp.broadcast_to(index[:, None, None], (3, BATCH, QUERIES)),
+        jnp.broadcast_to(places[:, None, None], (3, BATCH, QUERIES, 3)),
+    )
+    near = anchored(index, places)
+    near = near._replace(index=jnp.broadcast_to(near.index, (3, BATCH, 1)))
+    expected = module(EMBEDDINGS, POSITIONS, FEATURES, everywhere)
+    np.testing.assert_allclose(module(EMBEDDINGS, POSITIONS, FEATURES, near), expected, atol=1e-6)
+    known = module.with_deltas(POSITIONS, near)
+    assert known.deltas is not None
+    np.testing.assert_allclose(module(EMBEDDINGS, POSITIONS, FEATURES, known), expected, atol=1e-6)
+
+
+def test_bracketed_attention_maps_before_and_after():
+    module = BracketedVectorAttention(WIDTH, rngs=nnx.Rngs(1))
+    near = _of(NEIGHBOURS)
+    inner = module.attention(EMBEDDINGS, POSITIONS, module.before(FEATURES), near)
+    expected = EMBEDDINGS + module.after(inner)
+    np.testing.assert_allclose(module.to_basis(EMBEDDINGS, POSITIONS, FEATURES, near), expected, atol=1e-6)
+    among = nearest_neighbours(POSITIONS, POSITIONS, K)
+    mapped = module.before(EMBEDDINGS)
+    expected = EMBEDDINGS + module.after(module.attention(mapped, POSITIONS, mapped, among))
+    np.testing.assert_allclose(module.among_queries(EMBEDDINGS, POSITIONS, among), expected, atol=1e-6)
+
+
+def test_the_release_scales_its_logits():
+    """Dividing the logits by the root of the width equals scaling gamma's last layer; its bias is idle."""
+    scaled = VectorAttention(WIDTH, like_release=True, rngs=nnx.Rngs(2))
+    plain = VectorAttention(WIDTH, rngs=nnx.Rngs(2))
+    plain.gamma_out.kernel[...] /= np.sqrt(WIDTH)
+    scaled.gamma_out.bias[...] += 3.0
+    arguments = (EMBEDDINGS, POSITIONS, FEATURES, _of(NEIGHBOURS))
+    np.testing.assert_allclose(scaled(*arguments), plain(*arguments), atol=1e-5)

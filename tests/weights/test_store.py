@@ -13,6 +13,7 @@ import pytest
 import poem_jax
 from poem_jax.models import poem
 from poem_jax.models.config import BasisConfig, Config, DecoderConfig, ResNetConfig, RootConfig, Stem
+from poem_jax.models.config_json import to_json
 from poem_jax.weights import store
 
 MICRO = Config(
@@ -189,7 +190,7 @@ def test_a_damaged_config_is_a_value_error(saved, text):
 
 
 def test_a_config_that_is_not_the_arrays_own_is_a_value_error(saved):
-    (saved / "config.json").write_text(poem_jax.models.config.to_json(replace(MICRO, width=32)))
+    (saved / "config.json").write_text(to_json(replace(MICRO, width=32)))
     with pytest.raises(ValueError, match=r"arrays do not fit the config: .*Use the config"):
         store.load(saved)
 

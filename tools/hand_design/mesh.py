@@ -34,7 +34,7 @@ _OTHER_WAY = frozenset((
 ))
 # fmt: on
 """Quads (by their first vertex) at the sides of the fingers whose diagonals are equally long, and which the
-shipped hand cuts from b to c. No rule gives them: rounding on one machine chose, and now they are the hand."""
+shipped hand cuts from b to c. No rule gives them: rounding on one machine chose; now they are the hand."""
 
 
 class Mesh(NamedTuple):

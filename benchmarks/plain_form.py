@@ -1,0 +1,535 @@
+"""The plain form of POEM v2: the same function as `poem_jax.models`, with nothing done for speed.
+
+The oracle of the tests and the opponent of `benchmarks/inference.py`. It is written as the paper's equations
+read and as one first writes JAX: every convolution is `lax.conv_general_dilated`, batch norm is written out,
+residual blocks follow one by one, attention has its heads inside, vector attention makes whole
+(batch, query, k, c) arrays, and neighbours come from one `lax.top_k`. Cameras, triangulation, bilinear
+sampling and the hand are those of `poem_jax`: they are not what is optimised.
+
+It takes the same `params` and `Config`, and batches in which every view is valid: no masks, no training.
+
+Letters: w = the weights of one part, its running statistics among them; i = image = (batch, view).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from poem_jax.geometry.cameras import Cameras, project
+from poem_jax.geometry.neighbours import gather
+from poem_jax.geometry.sampling import sample_bilinear
+from poem_jax.geometry.transforms import rotation_from_6d, transform_points
+from poem_jax.geometry.triangulation import triangulate
+from poem_jax.hand.model import HandModel
+from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, ROOT_JOINT, join_queries, split_queries
+from poem_jax.models.batch_norm import EPSILON
+from poem_jax.models.config import (
+    AttentionKeys,
+    BehindCamera,
+    Config,
+    CoordinateUpdate,
+    DecoderConfig,
+    DecoderOutput,
+    FeatureFusion,
+    FirstNeighbours,
+    HeatActivation,
+    HRNetConfig,
+    Layout,
+    NeighbourSearch,
+    PositionCode,
+    QueryStart,
+    Similarity,
+    SingleView,
+    Stem,
+    VectorForm,
+    ViewWeights,
+)
+from poem_jax.models.parametric import HandParameters, root_relative_mesh
+from poem_jax.models.primary_frame import enter_primary_frame
+from poem_jax.models.query_start import pose_by_joints
+from poem_jax.typing import Array, Float, Int, Num, Params
+
+_TEMPERATURE = 10000.0
+_FALLBACK_ROOT = (0.0, 0.0, 0.5)
+
+Weights = dict[str, Any]
+IndexSets = list[Int[Array, "batch query k"]]
+"""What the searches found, in order: layer by layer the basis points and, if these are read, the queries."""
+
+
+class PlainResult(NamedTuple):
+    """What `poem_jax.forward` predicts, as far as it comes from the network; frames and units as there."""
+
+    layers: Float[Array, "layer batch query 3"]
+    """World, metres, in the order of the config."""
+    keypoints_px: Float[Array, "batch view joint 2"]
+    heat_maps: Float[Array, "batch view joint h w"]
+    root: Float[Array, "batch 3"]
+    """World, metres."""
+
+
+def plain_forward(
+    params: Params,
+    images: Num[Array, "batch view h w 3"],
+    cams: Cameras,
+    config: Config,
+    root: Float[Array, "batch 3"] | None = None,
+    neighbours: IndexSets | None = None,
+) -> tuple[PlainResult, IndexSets]:
+    """Compute what `poem_jax.models.poem.forward` does at inference for views that are all valid.
+
+    Args:
+        params: as there.
+        images: as there.
+        cams: as there; `view_mask` is not looked at.
+        config: static under `jax.jit`.
+        root: known roots, world, metres; NaN rows and None are triangulated.
+        neighbours: index sets to use instead of searching.
+
+    Returns: the result, and the index sets that were used.
+    """
+    frame = enter_primary_frame(Cameras(cams.K, cams.T_cam_from_world), root)
+    levels = plain_trunk(params, normalised(images, config), config)
+    keypoints_px, heat_maps = (_by_view(x, images) for x in plain_heat_maps(params, levels, config))
+    maps = _by_view(plain_features(params, levels, config), images)
+    joints, solved = _triangulated(keypoints_px, heat_maps, frame.cams, config)
+    centre = _root(joints, solved, frame.root)
+
+    tokens = plain_sampling_and_aggregation(params, maps, frame.cams, centre, config)
+    start = _start(params, joints - centre[:, None], solved, config)
+    moved, embeddings, found = plain_decoder(params, start, tokens, config, neighbours)
+    layers = [config.basis.radius * queries for queries in moved]
+    if config.decoder.output is DecoderOutput.HAND_PARAMETERS:
+        layers.append(_parametric_hand(params, embeddings, config))
+    to_world = frame.T_world_from_primary
+    layers_world = transform_points(to_world, jnp.stack(layers) + centre[:, None])
+    root_world = transform_points(to_world, centre[:, None])[:, 0]
+    return PlainResult(layers_world, keypoints_px, heat_maps, root_world), found
+
+
+def normalised(images: Num[Array, "batch view h w 3"], config: Config) -> Float[Array, "image h w 3"]:
+    """Return all images in a row, as the trunk takes them."""
+    scale = 255.0 if images.dtype == jnp.uint8 else 1.0
+    flat = images.reshape(-1, *images.shape[2:]).astype(jnp.float32)
+    return (flat / scale - config.image_mean) / config.image_std
+
+
+# The trunk.
+
+
+def plain_trunk(params: Params, images: Float[Array, "image h w 3"], config: Config) -> list[Array]:
+    """Return the trunk's maps, finest first."""
+    w = _weights(params)["trunk"]
+    return _hrnet(images, w) if isinstance(config.backbone, HRNetConfig) else _resnet(images, w, config)
+
+
+def _hrnet(x: Array, w: Weights) -> list[Array]:
+    for conv in _rows(w["stem"]):
+        x = _conv_norm(x, conv, stride=2)
+    x = _residual(x, w["widen"])
+    for block in _unstacked(w["layer1"]["blocks"]):
+        x = _residual(x, block)
+    fine, coarse = _rows(w["transition1"])
+    maps = [_conv_norm(x, fine), _conv_norm(x, coarse, stride=2)]
+    for stage, transition in (("stage2", "transition2"), ("stage3", "transition3"), ("stage4", None)):
+        for module in _unstacked(w[stage]["blocks"]):
+            maps = _exchange(maps, module)
+        if transition is not None:
+            maps = [*maps, _conv_norm(maps[-1], w[transition], stride=2)]
+    return maps
+
+
+def _exchange(maps: list[Array], w: Weights) -> list[Array]:
+    """Run the blocks of every branch, then sum all branches into each."""
+    through = []
+    for x, branch in zip(maps, _rows(w["branches"]), strict=True):
+        for block in _unstacked(branch["blocks"]):
+            x = _residual(x, block)
+        through.append(x)
+    return [_fused(through, target, fuse) for target, fuse in enumerate(_rows(w["fuse"]))]
+
+
+def _fused(maps: list[Array], target: int, w: Weights) -> Array:
+    total = maps[target]
+    sources = [source for source in range(len(maps)) if source != target]
+    for source, path in zip(sources, _rows(w["paths"]), strict=True):
+        x = maps[source]
+        if source > target:
+            factor = 2 ** (source - target)
+            x = _conv_norm(x, path["conv"], relu=False)
+            total = total + jnp.repeat(jnp.repeat(x, factor, axis=1), factor, axis=2)
+        else:
+            *keep, last = _rows(path["convs"])
+            for conv in keep:
+                x = _conv_norm(x, conv, stride=2)
+            total = total + _conv_norm(x, last, stride=2, relu=False)
+    return jax.nn.relu(total)
+
+
+def _resnet(x: Array, w: Weights, config: Config) -> list[Array]:
+    if config.backbone.stem is Stem.CONVOLUTION:  # pyright: ignore[reportAttributeAccessIssue]
+        x = _max_pool(_conv_norm(x, w["stem"]["conv"], stride=2), 3, 2, 1)
+    else:
+        image, h, width, c = x.shape
+        cells = x.reshape(image, h // 4, 4, width // 4, 4, c).transpose(0, 1, 3, 2, 4, 5)
+        x = _conv_norm(cells.reshape(image, h // 4, width // 4, 16 * c), w["stem"]["conv"])
+    levels = []
+    for i, stage in enumerate(_rows(w["stages"])):
+        for j, block in enumerate(_rows(stage["blocks"])):
+            x = _residual(x, block, stride=2 if i > 0 and j == 0 else 1)
+        levels.append(x)
+    return levels
+
+
+def _residual(x: Array, w: Weights, stride: int = 1) -> Array:
+    """Apply a basic block or a bottleneck (He et al. 2016)."""
+    if "middle" in w:
+        y = _conv_norm(_conv_norm(x, w["reduce"]), w["middle"], stride=stride)
+        y = _conv_norm(y, w["expand"], relu=False)
+    else:
+        y = _conv_norm(_conv_norm(x, w["first"], stride=stride), w["second"], relu=False)
+    shortcut = _conv_norm(x, w["shortcut"], stride=stride, relu=False) if "shortcut" in w else x
+    return jax.nn.relu(y + shortcut)
+
+
+def _conv_norm(x: Array, w: Weights, *, stride: int = 1, relu: bool = True) -> Array:
+    y, norm = _conv(x, w["conv"], stride), w["norm"]
+    y = (y - norm["mean"]) / jnp.sqrt(norm["variance"] + EPSILON) * norm["scale"] + norm["bias"]
+    return jax.nn.relu(y) if relu else y
+
+
+def _conv(x: Array, w: Weights, stride: int = 1) -> Array:
+    pad = (w["kernel"].shape[0] - 1) // 2
+    y = jax.lax.conv_general_dilated(
+        x, w["kernel"], (stride, stride), [(pad, pad)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+    return y + w["bias"] if "bias" in w else y
+
+
+# The 2D branches.
+
+
+def plain_heat_maps(
+    params: Params, levels: list[Array], config: Config
+) -> tuple[Float[Array, "image joint 2"], Float[Array, "image joint h w"]]:
+    """Return the joints in pixels, and the heat maps whose expectation they are (paper, eq. 3)."""
+    w, root = _weights(params)["heat_maps"], config.root
+    x = _top_down(levels, w["branch"], config.backbone.strides.index(root.branch_stride))
+    logits = _conv(_max_pool(x, root.pooling, root.pooling), w["to_logits"]).transpose(0, 3, 1, 2)
+    heat = jnp.exp(logits) if root.activation is HeatActivation.SOFTMAX else jax.nn.sigmoid(logits)
+    heat = heat / jnp.sum(heat, (-2, -1), keepdims=True)
+    rows, columns = (root.stride * (jnp.arange(size) + root.cell_offset) for size in heat.shape[-2:])
+    u, v = jnp.einsum("ijhw,w->ij", heat, columns), jnp.einsum("ijhw,h->ij", heat, rows)
+    return jnp.stack([u, v], -1), heat
+
+
+def plain_features(params: Params, levels: list[Array], config: Config) -> Float[Array, "image h w c"]:
+    """Return the maps that the basis points sample, without the position code."""
+    w = _weights(params)["features"]
+    if config.features.fusion is FeatureFusion.TOP_DOWN:
+        x = _top_down(levels, w["branch"], config.backbone.strides.index(config.features.stride))
+    else:
+        x = levels[0]
+        for reduce, coarser in zip(_rows(w["branch"]["reductions"]), levels[1:], strict=True):
+            x = _conv_norm(x, reduce, stride=2) + coarser
+        x = _conv(_doubled(x), w["branch"]["squeeze"])
+    return _conv(x, w["project"])
+
+
+def _top_down(levels: list[Array], w: Weights, finest: int) -> Array:
+    x, *finer_ones = levels[finest:][::-1]
+    for merge, finer in zip(_rows(w.get("merges", {})), finer_ones, strict=True):
+        x = _conv_norm(jnp.concatenate([_doubled(x), finer], -1), merge)
+    return x
+
+
+def _doubled(x: Array) -> Array:
+    image, h, w, c = x.shape
+    return jax.image.resize(x, (image, 2 * h, 2 * w, c), "bilinear")
+
+
+def _max_pool(x: Array, size: int, stride: int, pad: int = 0) -> Array:
+    padding = ((0, 0), (pad, pad), (pad, pad), (0, 0))
+    return jax.lax.reduce_window(
+        x, -jnp.inf, jax.lax.max, (1, size, size, 1), (1, stride, stride, 1), padding
+    )
+
+
+# From the views to the basis points.
+
+
+def plain_sampling_and_aggregation(
+    params: Params,
+    maps: Float[Array, "batch view h w c"],
+    cams: Cameras,
+    root: Float[Array, "batch 3"],
+    config: Config,
+) -> Float[Array, "batch basis c"]:
+    """Return the features of the basis points about `root`; all in the primary camera's frame."""
+    w = _weights(params)
+    if config.features.position_code is PositionCode.VIEW_ROW_COLUMN:
+        maps = maps + _view_row_column_code(w["features"]["position"]["mix"], maps.shape)
+    points = root[:, None] + params["constants"]["basis_points"]
+    uv_px, depth = project(cams.K, cams.T_cam_from_world, points[:, None])
+    share = uv_px / jnp.array(config.image_hw[::-1], jnp.float32)
+    sampled = sample_bilinear(maps, share * jnp.array(maps.shape[-3:-1][::-1], jnp.float32))
+    if config.basis.behind_camera is BehindCamera.ZEROS:
+        seen = (depth > 0)[..., None]
+        sampled, share = jnp.where(seen, sampled, 0), jnp.where(seen, share, 0)
+    if config.features.position_code is PositionCode.PROJECTED_POINT:
+        sampled = sampled + _sine_code(share, sampled.shape[-1])
+    return _aggregated(sampled, w["aggregation"], config)
+
+
+def _aggregated(sampled: Float[Array, "batch view basis c"], w: Weights, config: Config) -> Array:
+    """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N (paper, eq. 7-8)."""
+    batch, views, points, c = sampled.shape
+    if config.aggregation.layout is Layout.ROW_MAJOR:
+        tokens = sampled.transpose(0, 1, 3, 2).reshape(batch, points, views, c)
+    else:
+        tokens = sampled.transpose(0, 2, 1, 3)
+    theta = _two_layers(tokens, w["theta_in"], w["theta_out"])
+    first, sources = theta[:, :, 0], theta[:, :, 1:]
+    similarity = jnp.einsum("bnc,bnvc->bnv", first, sources)
+    if config.aggregation.similarity is Similarity.MEAN:
+        similarity = similarity / theta.shape[-1]
+    mixed = jnp.einsum("bnv,bnvc->bnc", similarity, sources)
+    if views == 1:
+        if config.aggregation.single_view is SingleView.PASS:
+            return tokens[:, :, 0]
+        mixed = first
+    return tokens[:, :, 0] + _two_layers(mixed, w["phi_in"], w["phi_out"]) / views
+
+
+def _view_row_column_code(w: Weights, shape: tuple[int, ...]) -> Float[Array, "view h w c"]:
+    """Mix sines and cosines of the numbers of view, row and column (release)."""
+    _, *sizes, c = shape
+    codes = []
+    for axis, size in enumerate(sizes):
+        angle = 2 * jnp.pi * (jnp.arange(size) + 1.0) / (size + 1e-6)
+        angle = angle[:, None] / _TEMPERATURE ** (2 * jnp.arange(c // 4) / (c // 2))
+        code = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)
+        along = [code.shape[0] if i == axis else 1 for i in range(3)]
+        codes.append(jnp.broadcast_to(code.reshape(*along, c // 2), (*sizes, c // 2)))
+    return _conv(jnp.concatenate(codes, -1), w)
+
+
+def _sine_code(share: Float[Array, "*batch 2"], width: int) -> Float[Array, "*batch c"]:
+    """Encode (u / W, v / H) by sines, v first (Carion et al. 2020)."""
+    half = width // 2
+    angle = 2 * jnp.pi * share[..., ::-1, None] * _TEMPERATURE ** (-2.0 * jnp.arange(half // 2) / half)
+    return jnp.stack([jnp.sin(angle), jnp.cos(angle)], -1).reshape(*share.shape[:-1], width)
+
+
+# The root, and where the query points start.
+
+
+def _triangulated(
+    uv_px: Array, heat: Array, cams: Cameras, config: Config
+) -> tuple[Float[Array, "batch joint 3"], Array]:
+    weights = None
+    if config.root.view_weights is ViewWeights.HEAT_SPREAD:
+        cells = uv_px / config.root.stride - config.root.cell_offset
+        h, w = heat.shape[-2:]
+        off_u, off_v = jnp.arange(w) - cells[..., :1], jnp.arange(h) - cells[..., 1:]
+        squares = off_u[..., None, :] ** 2 + off_v[..., :, None] ** 2
+        weights = 1 / jnp.maximum(jnp.sum(heat * squares, (-2, -1)), 0.25)
+    K, T = cams.K, cams.T_cam_from_world
+    joints, solved = triangulate(uv_px, K, T, weights, normalise_rows=config.root.unit_rows)
+    _, depth = project(K, T, joints[:, None])
+    return joints, solved & jnp.all(depth > 0, 1)
+
+
+def _root(joints: Array, solved: Array, known: Array | None) -> Float[Array, "batch 3"]:
+    index = ROOT_JOINT if joints.shape[1] == NUM_JOINTS else 0
+    root = jnp.where(solved[:, index, None], joints[:, index], jnp.array(_FALLBACK_ROOT))
+    if known is None:
+        return root
+    return jnp.where(jnp.all(jnp.isfinite(known), -1, keepdims=True), known, root)
+
+
+def _start(params: Params, joints: Array, solved: Array, config: Config) -> Float[Array, "batch query 3"]:
+    """Return the query points before the first layer, basis radii about the root."""
+    template, order = params["constants"]["template_queries"], config.decoder.query_order
+    posed = jnp.broadcast_to(template, (joints.shape[0], *template.shape))
+    if config.decoder.query_start is QueryStart.JOINTS:
+        length = jnp.maximum(jnp.linalg.norm(joints, axis=-1, keepdims=True), 1e-6)
+        joints = joints * jnp.minimum(1.0, 1.5 * config.basis.radius / length)
+        vertices = pose_by_joints(_hand(params), *split_queries(template, order), joints)
+        there = join_queries(vertices, joints, order)
+        posed = jnp.where(jnp.all(solved, -1)[:, None, None], there, posed)
+    return posed / config.basis.radius
+
+
+# The decoder.
+
+
+def plain_decoder(
+    params: Params,
+    queries: Float[Array, "batch query 3"],
+    features: Float[Array, "batch basis c"],
+    config: Config,
+    neighbours: IndexSets | None = None,
+) -> tuple[list[Float[Array, "batch query 3"]], Float[Array, "batch query c"], IndexSets]:
+    """Return the query points after every layer that moves them, the last embeddings, and the index sets.
+
+    Coordinates are in basis radii about the root.
+    """
+    w, decoder = _weights(params)["decoder"], config.decoder
+    points = params["constants"]["basis_points"] / config.basis.radius
+    points = jnp.broadcast_to(points, (len(queries), *points.shape))
+    e = jnp.broadcast_to(w["embeddings"], (len(queries), *w["embeddings"].shape))
+    if decoder.embed_coordinates:
+        features = features + _two_layers(points, w["locate"]["hidden"], w["locate"]["out"])
+    given, found, moved, around = iter(neighbours or []), [], [], []
+    for i, layer in enumerate(_rows(w["layers"])):
+        clouds = [points, queries] if decoder.vector_form is VectorForm.QUERIES_THEN_BASIS else [points]
+        if i == 0 and decoder.first_neighbours is FirstNeighbours.ANCHORS:
+            around = [_anchors(params, queries)] * len(clouds)
+        elif i == 0 or decoder.neighbour_search is NeighbourSearch.EVERY_LAYER:
+            sets = [next(given) if neighbours else _nearest(queries, c, decoder) for c in clouds]
+            around = [(index, gather(cloud, index)) for index, cloud in zip(sets, clouds, strict=True)]
+            found += sets
+        if decoder.embed_coordinates:
+            e = e + _two_layers(queries, w["locate"]["hidden"], w["locate"]["out"])
+        e, queries = _layer(e, queries, features, around, layer, decoder)
+        moved.append(queries)
+    parametric = decoder.output is DecoderOutput.HAND_PARAMETERS
+    return moved[:-1] if parametric else moved, e, found
+
+
+def _nearest(queries: Array, points: Array, decoder: DecoderConfig) -> Int[Array, "batch query k"]:
+    distance = jnp.sum((queries[:, :, None] - points[:, None]) ** 2, -1)
+    return jax.lax.top_k(-distance, decoder.num_neighbours)[1]
+
+
+def _anchors(params: Params, queries: Array) -> tuple[Array, Array]:
+    """Return the rows and positions that every query reads in the first layer."""
+    index, positions = (params["constants"]["anchors"][name] for name in ("index", "positions"))
+    shape = (*queries.shape[:2], len(index))
+    return jnp.broadcast_to(index, shape), jnp.broadcast_to(positions, (*shape, 3))
+
+
+def _layer(
+    e: Array, x: Array, features: Array, around: list, w: Weights, decoder: DecoderConfig
+) -> tuple[Array, Array]:
+    epsilon, norms = decoder.layer_norm_epsilon, _rows(w["norms"])
+    if decoder.shared_embedding:
+        e, features = _linear(e, w["embed"]), _linear(features, w["embed"])
+    basis = features[:, :: decoder.cross_attention_basis_stride]
+    read = e if decoder.first_attention is AttentionKeys.QUERIES else basis
+    e = _layer_norm(e + _attention(e, read, w["self_attention"], decoder.num_heads), norms[0], epsilon)
+    e = _layer_norm(e + _attention(e, basis, w["cross_attention"], decoder.num_heads), norms[1], epsilon)
+    vector = w["vector_attention"]
+    if decoder.vector_form is VectorForm.BASIS:
+        e = _layer_norm(e + _vector_attention(e, x, features, *around[0], vector), norms[2], epsilon)
+    else:
+        scale, near_basis, near_queries = e.shape[-1] ** -0.5, around[0], around[1]
+        among, to_basis = vector["queries"], vector["basis"]
+        mapped = _linear(e, among["before"])
+        read = _vector_attention(mapped, x, mapped, *near_queries, among["attention"], scale)
+        e = e + _linear(read, among["after"])
+        mapped = _linear(features, to_basis["before"])
+        read = _vector_attention(e, x, mapped, *near_basis, to_basis["attention"], scale)
+        e = e + _linear(read, to_basis["after"])
+    if decoder.coordinate_update is CoordinateUpdate.FEED_FORWARD:
+        moves = "feed_forward" in w
+        return e, x + _offsets(e, w["feed_forward"]) if moves else x
+    if "branch" in w:
+        x = x + _offsets(e, w["branch"])
+    if "feed_forward" in w:
+        ffn = w["feed_forward"]
+        update = _linear(jax.nn.gelu(_linear(e, ffn["hidden"]), approximate=False), ffn["out"])
+        e = _layer_norm(e + update, ffn["norm"], epsilon)
+    return e, x
+
+
+def _attention(queries: Array, tokens: Array, w: Weights, heads: int) -> Float[Array, "batch query c"]:
+    """softmax(Q K^T / sqrt(d / heads)) V, projected (paper, eq. 10)."""
+    q, k, v = (
+        _linear(x, w[name]).reshape(*x.shape[:2], heads, -1)
+        for x, name in ((queries, "query"), (tokens, "key"), (tokens, "value"))
+    )
+    logits = jnp.einsum("bqhc,bthc->bhqt", q, k) / jnp.sqrt(q.shape[-1])
+    read = jnp.einsum("bhqt,bthc->bqhc", jax.nn.softmax(logits, -1), v)
+    return _linear(read.reshape(queries.shape), w["out"])
+
+
+def _vector_attention(
+    e: Float[Array, "batch query c"],
+    x: Float[Array, "batch query 3"],
+    features: Float[Array, "batch point c"],
+    index: Int[Array, "batch query k"],
+    positions: Float[Array, "batch query k 3"],
+    w: Weights,
+    scale: float = 1.0,
+) -> Float[Array, "batch query c"]:
+    """sum_j softmax_j(gamma(alpha(E_i) - beta(F_j) + delta_ij)) * (psi(F_j) + delta_ij) (paper, eq. 11)."""
+    near = gather(features, index)
+    delta = _two_layers(x[:, :, None] - positions, w["xi_in"], w["xi_out"])
+    inside = _linear(e, w["alpha"])[:, :, None] - _linear(near, w["beta"]) + delta
+    logits = scale * _two_layers(inside, w["gamma_in"], w["gamma_out"])
+    return jnp.sum(jax.nn.softmax(logits, axis=2) * (_linear(near, w["psi"]) + delta), axis=2)
+
+
+def _offsets(e: Array, w: Weights) -> Float[Array, "batch query 3"]:
+    return _two_layers(e, w["hidden"], w["offset"])
+
+
+def _parametric_hand(params: Params, e: Float[Array, "batch query c"], config: Config) -> Array:
+    """Return the query points of the hand whose pose and shape the last embeddings tell."""
+    w, (batch, query, c) = _weights(params)["regressor"], e.shape
+    by_name = config.decoder.pooling is Layout.BY_NAME
+    channels = e.transpose(0, 2, 1) if by_name else e.reshape(batch, c, query)
+    numbers = _linear(_linear(channels, w["pool"])[..., 0], w["regress"])
+    sixd, shape = numbers[:, : 6 * NUM_SKELETON_JOINTS], numbers[:, 6 * NUM_SKELETON_JOINTS :]
+    rotations = rotation_from_6d(sixd.reshape(batch, NUM_SKELETON_JOINTS, 6))
+    mesh = root_relative_mesh(_hand(params), HandParameters(rotations, shape))
+    return join_queries(*mesh, config.decoder.query_order)
+
+
+# Layers and weights.
+
+
+def _linear(x: Array, w: Weights) -> Array:
+    y = x @ w["kernel"]
+    return y + w["bias"] if "bias" in w else y
+
+
+def _two_layers(x: Array, first: Weights, second: Weights) -> Array:
+    return _linear(jax.nn.relu(_linear(x, first)), second)
+
+
+def _layer_norm(x: Array, w: Weights, epsilon: float) -> Array:
+    mean, variance = jnp.mean(x, -1, keepdims=True), jnp.var(x, -1, keepdims=True)
+    return (x - mean) / jnp.sqrt(variance + epsilon) * w["scale"] + w["bias"]
+
+
+def _weights(params: Params) -> Weights:
+    """Return what is trained and the running statistics in one tree."""
+    return _joined(params["trainable"], params["statistics"])
+
+
+def _joined(a: Weights, b: Weights) -> Weights:
+    both = {key: _joined(a[key], b[key]) for key in a.keys() & b.keys()}
+    return {**a, **b, **both}
+
+
+def _rows(w: Weights) -> list[Weights]:
+    """Return the entries of a list, whose keys are "0", "1", ..."""
+    return [w[str(i)] for i in range(len(w))]
+
+
+def _unstacked(w: Weights) -> list[Weights]:
+    """Return the weights of each of the blocks that `w` holds along a leading axis."""
+    count = len(jax.tree.leaves(w)[0])
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], w) for i in range(count)]
+
+
+def _hand(params: Params) -> HandModel:
+    return HandModel(**{name: jnp.asarray(value) for name, value in params["constants"]["hand"].items()})
+
+
+def _by_view(x: Array, images: Array) -> Array:
+    return x.reshape(*images.shape[:2], *x.shape[1:])

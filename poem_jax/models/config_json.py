@@ -1,0 +1,87 @@
+"""The JSON form of a model's configuration, saved beside every checkpoint.
+
+Unknown keys, missing kinds and values of another type fail; an absent key takes its default.
+"""
+
+import dataclasses
+import enum
+import json
+import types
+import typing
+from typing import Any, TypeVar
+
+from poem_jax.models.config import Config, require
+
+_T = TypeVar("_T")
+_KIND = "kind"
+
+
+def to_json(config: Config) -> str:
+    """Write a config as JSON text; dataclasses that are one of several carry their class name as `kind`."""
+    return json.dumps(_encode(config, Config), indent=2)
+
+
+def from_json(text: str) -> Config:
+    """Read a config from JSON text.
+
+    Raises:
+        ValueError: unknown key, missing or unknown `kind`, a value of the wrong type, or one that breaks a
+            rule of its dataclass.
+    """
+    return _decode(json.loads(text), Config, "config")
+
+
+def _encode(value: Any, declared: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        hints = typing.get_type_hints(type(value))
+        entries = {f.name: _encode(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
+        return {_KIND: type(value).__name__, **entries} if _is_union(declared) else entries
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _decode(value: Any, declared: Any, path: str) -> Any:
+    if _is_union(declared):
+        return _decode_union(value, declared, path)
+    if dataclasses.is_dataclass(declared):
+        return _decode_dataclass(value, typing.cast(type, declared), path)
+    if typing.get_origin(declared) is tuple:
+        return _decode_tuple(value, typing.get_args(declared), path)
+    if issubclass(declared, enum.Enum):
+        return declared(value)
+    # A bool is an int to Python; a whole number is a good float.
+    accepted = (int, float) if declared is float else (declared,)
+    require(type(value) in accepted, f"`{path}` must be of type {declared.__name__}; got {value!r}")
+    return declared(value)
+
+
+def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any, ...]:
+    require(isinstance(value, list), f"`{path}` must be a list; got {value!r}")
+    if entries[-1] is Ellipsis:
+        entries = entries[:1] * len(value)
+    require(len(value) == len(entries), f"`{path}` must have {len(entries)} entries; got {value!r}")
+    return tuple(
+        _decode(v, declared, f"{path}.{i}")
+        for i, (v, declared) in enumerate(zip(value, entries, strict=True))
+    )
+
+
+def _decode_union(value: Any, declared: Any, path: str) -> Any:
+    require(isinstance(value, dict), f"`{path}` must be an object; got {value!r}")
+    options = {option.__name__: option for option in typing.get_args(declared)}
+    kind = value.get(_KIND)
+    if kind not in options:
+        raise ValueError(f"`{path}.{_KIND}` must be one of {sorted(options)}; got {kind!r}")
+    return _decode_dataclass({k: v for k, v in value.items() if k != _KIND}, options[kind], path)
+
+
+def _decode_dataclass(value: Any, declared: type[_T], path: str) -> _T:
+    require(isinstance(value, dict), f"`{path}` must be an object; got {value!r}")
+    hints = typing.get_type_hints(declared)
+    unknown = sorted(set(value) - set(hints))
+    if unknown:
+        raise ValueError(f"`{path}` has unknown keys {unknown}; known are {sorted(hints)}")
+    return declared(**{key: _decode(entry, hints[key], f"{path}.{key}") for key, entry in value.items()})
+
+
+def _is_union(declared: Any) -> bool:
+    return isinstance(declared, types.UnionType)

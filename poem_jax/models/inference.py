@@ -1,0 +1,235 @@
+"""Inference at the cost of the views that exist: `prepare` once, then `infer`.
+
+`apply` is one pure program over padded views. Here the valid views of a batch are packed into chunks of a
+fixed size for the trunk, which is most of the work, and the hand is then found sample by sample, so that the
+cost follows the views that there are. All shapes are fixed by the padded batch: new masks compile nothing.
+
+On a CPU a chunk is one view, and as many threads as cores each run a program that uses one thread: XLA:CPU
+shares a single convolution badly among cores (measured on two: 106 GFLOP/s so, 158 with a view per thread, of
+187 that a matrix product reaches).
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from poem_jax.batch import Prediction
+from poem_jax.geometry.cameras import Cameras, fill_masked_views
+from poem_jax.models import parameters
+from poem_jax.models.batch_norm import NormMode
+from poem_jax.models.checks import check_inputs
+from poem_jax.models.config import Config
+from poem_jax.models.decoder import Surroundings
+from poem_jax.models.far_world import Origin, centre_world, move_back
+from poem_jax.models.poem import normalised_images
+from poem_jax.models.primary_frame import enter_primary_frame, leave_primary_frame
+from poem_jax.models.reconstruction import ViewFeatures
+from poem_jax.typing import Array, Float, Num, Params
+
+_VIEWS_AT_A_TIME = 8
+"""Views that an accelerator takes at a time."""
+_ONE_THREAD = {"xla_cpu_multi_thread_eigen": False}
+"""Compiler option for programs of which several run side by side."""
+
+_Result = TypeVar("_Result")
+
+
+class Prepared(NamedTuple):
+    """A model ready for inference: its parameters, and what does not depend on the images."""
+
+    params: Params
+    first: Surroundings | None
+    """Whom the first decoder layer reads, and what the offsets contribute; None where samples differ."""
+
+
+def prepare(params: Params, config: Config) -> Prepared:
+    """Check the parameters and compute what is constant in them.
+
+    Raises:
+        ValueError: `params` of another config.
+    """
+    parameters.check_params(config, params)
+    return jax.device_put(Prepared(params, _first_surroundings(params, config)))
+
+
+def infer(
+    prepared: Prepared,
+    views: Num[Array, "batch view h w 3"],
+    cams: Cameras,
+    *,
+    config: Config,
+    root_world: Float[Array, "batch 3"] | None = None,
+) -> Prediction:
+    """Do what `apply` does, faster: the same arguments, results and errors, for concrete inputs only.
+
+    Not pure: it looks at `cams.view_mask` to skip the views that are not there. `heat_maps` and
+    `keypoints_px` of masked views are zero.
+
+    Raises:
+        ValueError: as `apply`, and traced inputs.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((views, cams, root_world))):
+        raise ValueError("`infer` looks at the values of its inputs; under jit, grad or vmap use `apply`")
+    check_inputs(views, cams, root_world, config)
+    return run_packed(prepared, views, cams, config=config, root_world=root_world)
+
+
+def run_packed(
+    prepared: Prepared,
+    views: Num[Array, "batch view h w 3"],
+    cams: Cameras,
+    *,
+    config: Config,
+    root_world: Float[Array, "batch 3"] | None = None,
+) -> Prediction:
+    """Do what `infer` does without its checks: a sample that cannot be solved has `valid` False.
+
+    A view that is masked, or whose image or camera is not finite, is left out.
+    """
+    dtype = prepared.params["constants"]["basis_points"].dtype
+    cams, root, origin = centre_world(cams, root_world, dtype)
+    mask = np.asarray(cams.view_mask)
+    sound = (
+        mask & _finite_per_view(views) & _finite_per_view(cams.K) & _finite_per_view(cams.T_cam_from_world)
+    )
+    seen = _look_at_valid(prepared, np.asarray(views), sound, config)
+    K, T_cam_from_world, _ = fill_masked_views(Cameras(cams.K, cams.T_cam_from_world, sound))
+    if root is None:
+        root = np.full((len(mask), 3), np.nan)
+    samples = _Samples(
+        seen,
+        Cameras(np.asarray(K, dtype), np.asarray(T_cam_from_world, dtype), sound),
+        np.asarray(root, dtype),
+        (sound == mask).all(-1),
+        origin,
+    )
+    return _find_hands(prepared, samples, config)
+
+
+class _Samples(NamedTuple):
+    """What the second half needs, all with a leading batch axis."""
+
+    seen: ViewFeatures
+    cams: Cameras
+    root: Float[Array, "batch 3"]
+    whole: Array
+    origin: Origin
+
+
+def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray, config: Config) -> ViewFeatures:
+    """Run the trunk over the valid views, chunk by chunk; masked views get zeros."""
+    packed = views[valid]
+    chunk = 1 if _on_cpu() else _VIEWS_AT_A_TIME
+    missing = -len(packed) % chunk
+    packed = np.concatenate([packed, np.zeros((missing, *packed.shape[1:]), packed.dtype)])
+    look = _program(_look, config, one_thread=_on_cpu())
+    chunks = [packed[start : start + chunk] for start in range(0, len(packed), chunk)]
+    buffers = _empty_features(config, views.dtype, valid.size + chunk)
+    for i, seen in enumerate(_side_by_side(lambda images: look(prepared, images), chunks)):
+        buffers = _write(buffers, seen, i * chunk)
+    place = np.where(valid, np.cumsum(valid).reshape(valid.shape) - 1, valid.size)
+    return _read(buffers, place)
+
+
+def _find_hands(prepared: Prepared, samples: _Samples, config: Config) -> Prediction:
+    """Run the second half: on accelerators the whole batch at once, on a CPU each sample in a thread."""
+    batch = len(samples.root)
+    size = 1 if _on_cpu() else batch
+    find = _program(_find, config, one_thread=_on_cpu() and batch > 1)
+    parts = [
+        jax.tree.map(lambda leaf, start=start: leaf[start : start + size], samples)
+        for start in range(0, batch, size)
+    ]
+    found = _side_by_side(lambda part: find(prepared, part), parts)
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    return joined._replace(layers_world=jnp.moveaxis(joined.layers_world, 0, 1))
+
+
+def _side_by_side(work: Callable[[Any], _Result], parts: list) -> list[_Result]:
+    """Apply `work` to all parts: in one thread a core on a CPU, in order on an accelerator."""
+    threads = min(_cores() if _on_cpu() else 1, len(parts))
+    if threads <= 1:
+        return [work(part) for part in parts]
+    with ThreadPoolExecutor(threads) as pool:
+        # Waiting inside the thread is what keeps one program in each.
+        return list(pool.map(lambda part: jax.block_until_ready(work(part)), parts))
+
+
+def _cores() -> int:
+    """Count the cores that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
+def _look(prepared: Prepared, images: Array, *, config: Config) -> ViewFeatures:
+    model = parameters.assemble(config, prepared.params)
+    dtype = prepared.params["constants"]["basis_points"].dtype
+    return model.look(normalised_images(images, config, dtype), NormMode())
+
+
+def _find(prepared: Prepared, samples: _Samples, *, config: Config) -> Prediction:
+    """Find the hands; `layers_world` with the batch axis first, like all the rest."""
+    model = parameters.assemble(config, prepared.params)
+    frame = enter_primary_frame(samples.cams, samples.root)
+    result = model.reconstruct(samples.seen, frame.cams, frame.root, NormMode(), prepared.first)
+    result = result._replace(valid=result.valid & samples.whole)
+    hand, order = model.hand.model(), config.decoder.query_order
+    prediction = leave_primary_frame(result, frame.T_world_from_primary, hand, order)
+    prediction = move_back(prediction, samples.origin)
+    return prediction._replace(layers_world=jnp.moveaxis(prediction.layers_world, 1, 0))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _first_surroundings(params: Params, config: Config) -> Surroundings | None:
+    return parameters.assemble(config, params).prepared_surroundings()
+
+
+@functools.lru_cache(maxsize=32)
+def _program(function: Callable, config: Config, one_thread: bool) -> Callable:
+    """Return the jitted function of (prepared, batch) for one model."""
+    options = _ONE_THREAD if one_thread else None
+    return jax.jit(functools.partial(function, config=config), compiler_options=options)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _empty_features(config: Config, image_dtype: np.dtype, count: int) -> ViewFeatures:
+    described = parameters.describe(config)
+    image = jax.ShapeDtypeStruct((1, *config.image_hw, 3), image_dtype)
+    shapes = jax.eval_shape(functools.partial(_look, config=config), Prepared(described, None), image)
+    return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), shapes)
+
+
+@functools.partial(jax.jit, donate_argnums=0)
+def _write(buffers: ViewFeatures, seen: ViewFeatures, start: Array) -> ViewFeatures:
+    return jax.tree.map(
+        lambda buffer, part: jax.lax.dynamic_update_slice_in_dim(buffer, part, start, 0), buffers, seen
+    )
+
+
+@jax.jit
+def _read(buffers: ViewFeatures, place: Array) -> ViewFeatures:
+    """Take the rows of the valid views; the row behind the last view is nobody's."""
+
+    def rows(buffer: Array) -> Array:
+        empty = (place == place.size).reshape(*place.shape, *[1] * (buffer.ndim - 1))
+        return jnp.where(empty, 0, buffer[place])
+
+    return jax.tree.map(rows, buffers)
+
+
+def _finite_per_view(values: Array) -> np.ndarray:
+    values = np.asarray(values)
+    if values.dtype == np.uint8:
+        return np.ones(values.shape[:2], bool)
+    return np.isfinite(values).all(tuple(range(2, values.ndim)))

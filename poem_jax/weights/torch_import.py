@@ -1,0 +1,319 @@
+"""Released POEM-v2 weights in, and ours out: between a PyTorch state dict and `(config, params)`.
+
+Arrays only: no torch. `io/torch_file.py` reads and writes the files.
+"""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from poem_jax.hand import mano_file
+from poem_jax.hand.model import HandModel
+from poem_jax.hand.topology import NUM_QUERIES
+from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
+from poem_jax.models.presets import preset
+from poem_jax.models.reconstruction import template_queries
+from poem_jax.typing import Float, Int, Params
+from poem_jax.weights.entries import read_entries, write_entries
+from poem_jax.weights.release_keys import (
+    HEAD,
+    dead_shapes,
+    hand_prefixes,
+    is_parametric,
+    live_entries,
+)
+from poem_jax.weights.store import expected_leaves, flatten, unflatten
+from poem_jax.weights.trunk_keys import trunk_entries
+
+VARIANTS = ("v2-small", "v2-medium", "v2-large", "v2-medium-mano")
+"""The released models; each is the preset of that name with the suffix `-release`."""
+
+_SHOWN = 12
+_SAME_HAND_M = 1e-6
+_WORD_TABLE = 30522
+_BUFFERS = {
+    "th_betas": (1, 10),
+    "th_shapedirs": (778, 3, 10),
+    "th_posedirs": (778, 3, 135),
+    "th_v_template": (1, 778, 3),
+    "th_J_regressor": (16, 778),
+    "th_weights": (778, 16),
+    "th_faces": (1538, 3),
+    "th_hands_mean": (1, 45),
+}
+"""What the hand layer of the released code keeps of a MANO file."""
+_IGNORED_ENDINGS = ("embeddings.position_ids",)
+"""Written by older versions of the library that the decoder came from."""
+_CLASSIFIER = ("incre_modules.", "downsamp_modules.", "final_layer.", "classifier.", "fc.")
+"""Heads of ImageNet checkpoints."""
+
+_log = logging.getLogger(__name__)
+
+
+def convert(
+    state_dict: Mapping[str, np.ndarray],
+    variant: str,
+    *,
+    mano: HandModel | str | Path,
+    basis_points: Float[np.ndarray, "*one basis 3"],
+    anchor_points: Float[np.ndarray, "*one anchor 3"],
+    anchor_indices: Int[np.ndarray, "*one anchor"],
+) -> tuple[Config, Params]:
+    """Turn a released state dict into a model that `apply` runs.
+
+    The hand is the one that the state dict carries, as in the released code; `mano` gives what its buffers do
+    not say, and a warning is logged where the two differ.
+
+    Args:
+        state_dict: arrays by name; names may start with `module.`.
+        variant: one of `VARIANTS`.
+        mano: a right hand, or the path of a MANO `.pkl` or `.npz`.
+        basis_points: `bps.npy` of the release, metres about the root.
+        anchor_points: `anchor.npy`, in units of 10 cm about the root. Whether they lie on the template of the
+            hand is not checked here.
+        anchor_indices: `anchor_idx.npy`.
+
+    Returns: the config and the parameters, float32.
+
+    Raises:
+        ValueError: unknown variant; a left hand; constants of a wrong shape; and, all reported together,
+            names that are missing or unknown and arrays of another shape.
+    """
+    if variant not in VARIANTS:
+        raise ValueError(f"`variant` must be one of {', '.join(VARIANTS)}; got {variant!r}")
+    config = preset(f"{variant}-release")
+    hand = _right_hand(mano)
+    state = {name.removeprefix("module."): np.asarray(array) for name, array in state_dict.items()}
+    leaves, problems = read_entries(list(live_entries(config)), state, expected_leaves(config))
+    problems += _unknown_or_unlike(state, config)
+    if problems:
+        raise ValueError(_report(problems, state, variant))
+    leaves |= _constants(config, state, hand, basis_points, anchor_points, anchor_indices)
+    _check_finite(leaves)
+    return config, _params(config, leaves)
+
+
+def export_state_dict(config: Config, params: Params) -> dict[str, np.ndarray]:
+    """Turn a model back into a state dict that the released code loads.
+
+    Arrays on which no output of the release depends are zero (scales and variances of norms: one).
+
+    Raises:
+        ValueError: `config` is none of the released models.
+    """
+    if config not in [preset(f"{variant}-release") for variant in VARIANTS]:
+        raise ValueError(
+            "only the released models can be exported, the presets "
+            f"{', '.join(f'{variant}-release' for variant in VARIANTS)}; got another config"
+        )
+    leaves = flatten(params)
+    state = write_entries(list(live_entries(config)), leaves)
+    for name, shape in dead_shapes(config).items():
+        state[name] = _neutral(name, shape)
+    hand = HandModel(**{name: np.asarray(leaves[f"constants.hand.{name}"]) for name in HandModel._fields})
+    for prefix in hand_prefixes(config):
+        state |= {prefix + name: array for name, array in _buffers(hand).items()}
+    return state
+
+
+def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: Params) -> Params:
+    """Put ImageNet weights into the trunk of a model; all other parameters stay.
+
+    Args:
+        state_dict: HRNet's own names, or torchvision's for a ResNet; names may start with `module.`. The
+            classifier is ignored.
+        config: the model; its trunk must be the one that the weights are of.
+        params: its parameters.
+
+    Raises:
+        ValueError: all names that are missing or unknown and arrays of another shape.
+    """
+    trunk: HRNetConfig | ResNetConfig = config.backbone
+    state = {name.removeprefix("module."): np.asarray(array) for name, array in state_dict.items()}
+    entries = list(trunk_entries(trunk))
+    leaves, problems = read_entries(entries, state, expected_leaves(config))
+    known = {entry.source for entry in entries}
+    problems += [
+        f"{name}: unknown, got shape {array.shape}"
+        for name, array in state.items()
+        if name not in known and not name.startswith(_CLASSIFIER) and not name.endswith("num_batches_tracked")
+    ]
+    if problems:
+        raise ValueError(
+            f"the state dict is not a {type(trunk).__name__.removesuffix('Config')} of this size: "
+            f"{_shown(problems)}. Give the weights of the trunk that `config.backbone` describes"
+        )
+    _check_finite(leaves)
+    return unflatten({**flatten(params), **leaves}, params)
+
+
+def check_anchors(hand: HandModel, config: Config, anchor_points: Float[np.ndarray, "*one anchor 3"]) -> None:
+    """Insist that the anchors lie on the template of a hand, as the release's do on MANO's.
+
+    Raises:
+        ValueError: they do not; the hand is another one than the weights were trained with.
+    """
+    template = template_queries(hand, config.decoder.query_order) / config.basis.radius
+    anchors = np.asarray(anchor_points, np.float32).reshape(-1, 3)
+    gaps = np.linalg.norm(anchors[:, None] - template, axis=-1).min(1) * config.basis.radius
+    if gaps.max() > _ON_TEMPLATE_M:
+        raise ValueError(
+            f"the anchors must lie on the template of the hand; {int((gaps > _ON_TEMPLATE_M).sum())} of "
+            f"{len(anchors)} are up to {1000 * gaps.max():.1f} mm away. Give the MANO_RIGHT.pkl that the "
+            "weights were trained with, or accept other anchors with --accept-anchors"
+        )
+
+
+_ON_TEMPLATE_M = 1e-4
+
+
+def _right_hand(mano: HandModel | str | Path) -> HandModel:
+    hand = mano if isinstance(mano, HandModel) else mano_file.load(mano)
+    if bool(hand.is_left):
+        raise ValueError(
+            "`mano` must be a right hand, as the released models were trained on; got a left one. Give "
+            "MANO_RIGHT.pkl; left hands are mirrored before the model"
+        )
+    return hand
+
+
+def _unknown_or_unlike(state: dict[str, np.ndarray], config: Config) -> list[str]:
+    """List the problems of everything that the forward pass does not use."""
+    shapes = dead_shapes(config)
+    shapes |= {prefix + name: shape for prefix in hand_prefixes(config) for name, shape in _BUFFERS.items()}
+    live = {entry.source for entry in live_entries(config)}
+    problems = [f"{name}: missing, expected {shape}" for name, shape in shapes.items() if name not in state]
+    for name, array in state.items():
+        if name in shapes and array.shape != shapes[name]:
+            problems.append(f"{name}: expected shape {shapes[name]}, got {array.shape}")
+        if name not in shapes and name not in live and not name.endswith(_IGNORED_ENDINGS):
+            problems.append(f"{name}: unknown, got shape {array.shape}")
+    return problems
+
+
+def _report(problems: list[str], state: dict[str, np.ndarray], variant: str) -> str:
+    looks_like = _guess(state)
+    hint = "Is the file cut short, or of another model?"
+    if looks_like not in (None, variant):
+        hint = f"The state dict looks like {looks_like}: pass that variant."
+    return f"the state dict does not fit {variant}: {_shown(problems)}. {hint}"
+
+
+def _guess(state: dict[str, np.ndarray]) -> str | None:
+    """Tell the variant by the width of the query embeddings and by the parametric head."""
+    table = state.get(f"{HEAD}query_feat_embedding.weight")
+    if table is None or table.ndim != 2:
+        return None
+    parametric = any(name.endswith("mano_linear.weight") for name in state)
+    for variant in VARIANTS:
+        config = preset(f"{variant}-release")
+        if (config.width, is_parametric(config)) == (table.shape[1], parametric):
+            return variant
+    return None
+
+
+def _shown(problems: list[str]) -> str:
+    more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+    return f"{len(problems)} problems: {'; '.join(problems[:_SHOWN])}{more}"
+
+
+def _constants(
+    config: Config,
+    state: dict[str, np.ndarray],
+    hand: HandModel,
+    basis_points: np.ndarray,
+    anchor_points: np.ndarray,
+    anchor_indices: np.ndarray,
+) -> dict[str, np.ndarray]:
+    prefixes = [prefix for prefix, used in hand_prefixes(config).items() if used]
+    # The head's hand gives the template, the last layer's the parametric output.
+    template_hand, output_hand = (
+        _carried_hand(state, prefix, hand) for prefix in (prefixes[0], prefixes[-1])
+    )
+    count, k = config.basis.num_points, config.decoder.num_neighbours
+    index = _shaped("anchor_indices", anchor_indices, (k,))
+    if index.dtype.kind not in "iu" or index.min() < 0 or index.max() >= NUM_QUERIES:
+        raise ValueError(f"`anchor_indices` must be whole numbers from 0 to {NUM_QUERIES - 1}; got {index}")
+    return {
+        "constants.basis_points": _shaped("basis_points", basis_points, (count, 3)).astype(np.float32),
+        "constants.template_queries": template_queries(template_hand, config.decoder.query_order),
+        "constants.anchors.index": index.astype(np.int32),
+        "constants.anchors.positions": _shaped("anchor_points", anchor_points, (k, 3)).astype(np.float32),
+        **{f"constants.hand.{name}": np.asarray(value) for name, value in output_hand._asdict().items()},
+    }
+
+
+def _shaped(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(array)
+    if array.shape not in (shape, (1, *shape)):
+        raise ValueError(f"`{name}` must have shape {shape} or {(1, *shape)}; got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"`{name}` must be finite; got NaN or infinity")
+    return array.reshape(shape)
+
+
+def _carried_hand(state: dict[str, np.ndarray], prefix: str, hand: HandModel) -> HandModel:
+    """Return the hand in the buffers of a state dict; faces and side are those of `hand`."""
+    fields = {
+        name: state[f"{prefix}th_{name}"].astype(np.float32).reshape(getattr(hand, name).shape)
+        for name in ("v_template", "shapedirs", "posedirs", "J_regressor", "weights")
+    }
+    gap = np.abs(fields["v_template"] - hand.v_template).max()
+    if gap > _SAME_HAND_M:
+        _log.warning(
+            "the hand in %s differs from `mano` by up to %.2f mm; that of the weights is used",
+            prefix,
+            1000 * gap,
+        )
+    if np.any(state[f"{prefix}th_hands_mean"]):
+        _log.warning(
+            "%sth_hands_mean is not zero and is ignored: the released models have a flat hand", prefix
+        )
+    return hand._replace(**fields)
+
+
+def _buffers(hand: HandModel) -> dict[str, np.ndarray]:
+    values = {
+        "th_v_template": hand.v_template,
+        "th_shapedirs": hand.shapedirs,
+        "th_posedirs": hand.posedirs,
+        "th_J_regressor": hand.J_regressor,
+        "th_weights": hand.weights,
+        "th_faces": hand.faces.astype(np.int64),
+    }
+    return {
+        name: np.ascontiguousarray(values.get(name, np.zeros(shape, np.float32))).reshape(shape)
+        for name, shape in _BUFFERS.items()
+    }
+
+
+def _neutral(name: str, shape: tuple[int, ...]) -> np.ndarray:
+    if name.endswith("num_batches_tracked"):
+        return np.zeros(shape, np.int64)
+    is_norm = len(shape) == 1 and name.endswith((".weight", "running_var"))
+    return (np.ones if is_norm else np.zeros)(shape, np.float32)
+
+
+def _check_finite(leaves: dict[str, np.ndarray]) -> None:
+    broken = sorted(
+        name for name, leaf in leaves.items() if leaf.dtype.kind == "f" and not np.isfinite(leaf).all()
+    )
+    if broken:
+        raise ValueError(
+            f"weights must be finite; {len(broken)} arrays hold NaN or infinity: "
+            f"{', '.join(broken[:_SHOWN])}. Take a checkpoint from before the training failed"
+        )
+
+
+def _params(config: Config, leaves: dict[str, np.ndarray]) -> Params:
+    """Nest the leaves; every one of the model's must be there."""
+    template = expected_leaves(config)
+    missing = template.keys() - leaves.keys()
+    assert not missing, f"the table fills no {sorted(missing)}"
+    from poem_jax.models.parameters import describe
+
+    return unflatten(
+        {name: leaves[name].astype(leaf.dtype) for name, leaf in template.items()}, describe(config)
+    )

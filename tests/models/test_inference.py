@@ -1,0 +1,143 @@
+"""`infer` against `apply`: the same hands from the views that exist."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.hand.topology import NUM_QUERIES, QueryOrder
+from poem_jax.models import inference
+from poem_jax.models.config import (
+    AggregationConfig,
+    AttentionKeys,
+    BehindCamera,
+    CoordinateUpdate,
+    DecoderOutput,
+    FeatureConfig,
+    FeatureFusion,
+    FirstNeighbours,
+    Layout,
+    PositionCode,
+    RootConfig,
+    SingleView,
+    VectorForm,
+)
+from poem_jax.models.inference import infer, prepare
+from poem_jax.models.poem import apply
+
+METRES = 2e-5
+MASK = np.array([[1, 1, 0, 1], [0, 1, 1, 0], [1, 1, 1, 1]], bool)
+
+
+def like_release(micro, output=DecoderOutput.OFFSETS):
+    """All choices of the released models on a small one; every point a neighbour, so that no tie matters."""
+    return replace(
+        micro,
+        branch_bias=True,
+        root=RootConfig(num_joints=21, pooling=2, cell_offset=0.0, unit_rows=False),
+        features=FeatureConfig(
+            stride=4, fusion=FeatureFusion.BOTTOM_UP, position_code=PositionCode.VIEW_ROW_COLUMN
+        ),
+        basis=replace(micro.basis, num_points=NUM_QUERIES, behind_camera=BehindCamera.MIRRORED),
+        aggregation=AggregationConfig(
+            layout=Layout.ROW_MAJOR, single_view=SingleView.RESIDUAL, narrow_phi=True
+        ),
+        decoder=replace(
+            micro.decoder,
+            num_neighbours=NUM_QUERIES,
+            query_order=QueryOrder.JOINTS_FIRST,
+            first_attention=AttentionKeys.BASIS,
+            vector_form=VectorForm.QUERIES_THEN_BASIS,
+            first_neighbours=FirstNeighbours.ANCHORS,
+            coordinate_update=CoordinateUpdate.BRANCH_BEFORE,
+            shared_embedding=True,
+            layer_norm_epsilon=1e-12,
+            pooling=Layout.ROW_MAJOR,
+            output=output,
+        ),
+    )
+
+
+@pytest.fixture(params=["micro_config", "parametric_config", "release", "release_parametric"])
+def model(request, make_params, micro_config):
+    if request.param.startswith("release"):
+        parametric = request.param.endswith("parametric")
+        output = DecoderOutput.HAND_PARAMETERS if parametric else DecoderOutput.OFFSETS
+        config = like_release(micro_config, output)
+    else:
+        config = request.getfixturevalue(request.param)
+        config = replace(config, decoder=replace(config.decoder, num_neighbours=64))
+    return config, make_params(config)
+
+
+def test_infer_finds_what_apply_finds(model, make_scene):
+    config, params = model
+    views, cams = make_scene(3, 4)
+    cams = cams._replace(view_mask=MASK)
+    expected = apply(params, views, cams, config=config)
+    found = infer(prepare(params, config), views, cams, config=config)
+    assert found._fields == expected._fields
+    for name in ("vertices_world", "joints_world", "root_world", "layers_world", "translation", "shape"):
+        if getattr(expected, name) is not None:
+            wanted = getattr(expected, name)
+            np.testing.assert_allclose(getattr(found, name), wanted, atol=METRES, err_msg=name)
+    np.testing.assert_array_equal(found.valid, expected.valid)
+    np.testing.assert_allclose(found.keypoints_px[MASK], expected.keypoints_px[MASK], atol=1e-3)
+    assert not np.any(found.keypoints_px[~MASK])
+    assert not np.any(found.heat_maps[~MASK])
+
+
+def test_the_trunk_sees_only_the_views_that_exist(micro_config, make_params, make_scene, monkeypatch):
+    seen = []
+    inner = inference._side_by_side
+    monkeypatch.setattr(
+        inference, "_side_by_side", lambda work, parts: seen.append(len(parts)) or inner(work, parts)
+    )
+    views, cams = make_scene(3, 4)
+    prepared = prepare(make_params(micro_config), micro_config)
+    infer(prepared, views, cams._replace(view_mask=MASK), config=micro_config)
+    assert seen == [MASK.sum(), len(MASK)]
+
+
+def test_new_masks_compile_nothing(micro_config, make_params, make_scene):
+    views, cams = make_scene(3, 4)
+    prepared = prepare(make_params(micro_config), micro_config)
+    infer(prepared, views, cams._replace(view_mask=MASK), config=micro_config)
+    jitted = [inference._program(inference._look, micro_config, True)]
+    jitted += [inference._program(inference._find, micro_config, True), inference._write, inference._read]
+    before = [program._cache_size() for program in jitted]
+    for mask in (~MASK | np.array([True, True, False, False]), np.ones((3, 4), bool)):
+        infer(prepared, views, cams._replace(view_mask=mask), config=micro_config)
+    assert [program._cache_size() for program in jitted] == before
+
+
+def test_single_views_take_their_known_root(micro_config, make_params, make_scene):
+    views, cams = make_scene(2, 4)
+    cams = cams._replace(view_mask=np.array([[0, 0, 1, 0], [1, 1, 1, 1]], bool))
+    prepared = prepare(make_params(micro_config), micro_config)
+    with pytest.raises(ValueError, match=r"needs `root_world`.*samples \[0\]"):
+        infer(prepared, views, cams, config=micro_config)
+    root = np.array([[0.01, -0.02, 0.03], [np.nan] * 3], np.float32)
+    found = infer(prepared, views, cams, config=micro_config, root_world=root)
+    assert found.valid.all()
+    np.testing.assert_allclose(found.root_world[0], root[0], atol=1e-6)
+
+
+def test_broken_views_are_left_out_and_flagged(micro_config, make_params, make_scene):
+    views, cams = make_scene(2, 4)
+    K = cams.K.copy()
+    K[0, 1, 0, 0] = np.nan
+    prepared = prepare(make_params(micro_config), micro_config)
+    found = inference.run_packed(prepared, views, cams._replace(K=K), config=micro_config)
+    np.testing.assert_array_equal(found.valid, [False, True])
+    assert np.isfinite(found.vertices_world).all()
+
+
+def test_traces_and_other_parameters_are_refused(micro_config, parametric_config, make_params, make_scene):
+    views, cams = make_scene(2, 4)
+    prepared = prepare(make_params(micro_config), micro_config)
+    with pytest.raises(ValueError, match="under jit, grad or vmap use `apply`"):
+        jax.jit(lambda v: infer(prepared, v, cams, config=micro_config))(views)
+    with pytest.raises(ValueError, match="do not belong to `config`"):
+        prepare(make_params(micro_config), parametric_config)
