@@ -4,15 +4,17 @@ CONFIG is an experiment file that defines `config = TrainConfig(...)`, as those 
 model and the distribution of captures. Prints the paper's columns by view count and a table that shows which
 stage fails. Without --checkpoint the weights that come with the package are evaluated.
 
-The joints of every column are the model's direct predictions. POEM's released evaluation takes them for AUC
-only: its MPJPE, RR-J and PA-J compare joints regressed from the vertices of both sides, so those columns are
-not its numbers, also not with `--protocol poem`. The vertex columns are.
+The joints of every column are the model's direct predictions, but with `--protocol poem-release`: that takes
+them for AUC only, and joints regressed from the vertices of both sides for MPJPE, RR-J and PA-J, as POEM's
+released evaluation does.
 """
 
 import argparse
 import dataclasses
 import sys
 import time
+
+import jax
 
 from poem_jax.evaluation.benchmark import (
     DEFAULT_SEED,
@@ -24,6 +26,7 @@ from poem_jax.evaluation.benchmark import (
 )
 from poem_jax.evaluation.protocols import PROTOCOLS
 from poem_jax.evaluation.tables import format_report, write_json
+from poem_jax.hand.model import HandModel
 from poem_jax.io.compilation_cache import use_compilation_cache
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
@@ -86,12 +89,14 @@ def run(options: argparse.Namespace) -> dict[int, Scores]:
     _, params = load(weights, expected=config.model)
     captures = SyntheticDataset(captures_config(config), seed=options.seed)
     started = time.perf_counter()
-    results = run_benchmark(model_predictor(params, config.model), captures, settings)
+    hand = HandModel(**jax.device_get(params["constants"]["hand"]))
+    results = run_benchmark(model_predictor(params, config.model), captures, settings, hand)
     seconds = time.perf_counter() - started
     seen = ", which is the TRAINING seed" if options.seed == config.data.seed else ""
     print(f"{config.name}: weights {weights}, protocol {options.protocol}")
     print(f"{options.samples} synthetic captures of seed {options.seed}{seen}; {seconds:.0f} s\n")
-    print(format_report(results))
+    regressed = PROTOCOLS[options.protocol].regresses_joints
+    print(format_report(results, regressed_joints=regressed))
     return results
 
 

@@ -19,6 +19,7 @@ from poem_jax.evaluation.baselines import mean_pose, mean_pose_rotated, noisy_dl
 from poem_jax.evaluation.metrics import evaluate, point_distances
 from poem_jax.evaluation.protocols import MM_PER_METRE, find_protocol
 from poem_jax.geometry.cameras import Cameras
+from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models import poem
 from poem_jax.models.config import Config
@@ -110,13 +111,16 @@ def model_predictor(params: Params, config: Config) -> Predictor:
     return predict
 
 
-def run_benchmark(predict: Predictor, captures: Captures, settings: BenchmarkSettings) -> dict[int, Scores]:
+def run_benchmark(
+    predict: Predictor, captures: Captures, settings: BenchmarkSettings, hand: HandModel | None = None
+) -> dict[int, Scores]:
     """Score a model on captures 0, 1, ... for every view count.
 
     Args:
         predict: reconstructs a batch; see `model_predictor`.
         captures: samples with `pose`, at least as many views as `settings.views` asks for.
         settings: sizes and definitions.
+        hand: whose regressor the protocol `poem-release` uses; the others need none.
 
     Returns: per view count the metrics of `evaluate`, and `median_mpvpe_mm`, `mpvpe_true_root_mm` and its
     `median_`, `root_error_mm`, `dlt_2px_root_error_mm`, `mean_pose_mpvpe_mm`, `mean_pose_rotated_mpvpe_mm`,
@@ -139,7 +143,7 @@ def run_benchmark(predict: Predictor, captures: Captures, settings: BenchmarkSet
                 rows[n].append(_real(batch, _row(part, predict(part), draws[:, :n])))
                 bar.update()
     truth = _joined(truths)
-    return {n: _scores(_joined(rows[n]), truth, settings.protocol) for n in settings.views}
+    return {n: _scores(_joined(rows[n]), truth, settings.protocol, hand) for n in settings.views}
 
 
 def nested_views(batch: MultiViewBatch, num_views: int) -> MultiViewBatch:
@@ -207,7 +211,7 @@ def _joined(parts: list[_Leaves]) -> _Leaves:
     return type(parts[0])(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
 
-def _scores(rows: _Rows, truth: _Truth, protocol: str) -> Scores:
+def _scores(rows: _Rows, truth: _Truth, protocol: str, hand: HandModel | None) -> Scores:
     one_constant = mean_pose(truth.vertices, truth.joints, truth.T_primary_from_world)
     turned = mean_pose_rotated(truth.vertices, truth.joints, truth.global_rotation)
     root_true = truth.joints[:, ROOT_JOINT]
@@ -215,7 +219,9 @@ def _scores(rows: _Rows, truth: _Truth, protocol: str) -> Scores:
         MM_PER_METRE * point_distances(vertices, truth.vertices).mean(-1)
         for vertices in (rows.vertices, rows.vertices_given, one_constant, turned)
     )
-    official = evaluate(rows.joints, truth.joints, rows.vertices, truth.vertices, protocol=protocol)
+    official = evaluate(
+        rows.joints, truth.joints, rows.vertices, truth.vertices, protocol=protocol, hand=hand
+    )
     return official | {
         "median_mpvpe_mm": float(np.median(found)),
         "mpvpe_true_root_mm": float(given.mean()),

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from poem_jax.evaluation.alignment import align, align_by_joints, scale_translation, subtract_wrist
 from poem_jax.evaluation.protocols import AUC_LIMITS_MM, F_THRESHOLDS_MM, NO_SCORE, Protocol, find_protocol
+from poem_jax.hand.model import HandModel, joints_from_vertices
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.typing import Array, Float, Num
 
@@ -41,6 +42,7 @@ def evaluate(
     gt_vertices: Num[Array, "..."],
     *,
     protocol: str,
+    hand: HandModel | None = None,
 ) -> dict[str, float]:
     """Score predicted hands as an official evaluator does.
 
@@ -49,12 +51,15 @@ def evaluate(
     number of thresholds and unit; `poem`, `freihand` and `ho3d` add `f_5`, `f_15`, `pa_f_5`, `pa_f_15`;
     `ho3d` adds `sc_tr_mpjpe_mm`, `sc_tr_auc_j_50`. For `freihand` and `ho3d` a mesh of another vertex count
     than the ground truth scores -1 in every vertex error, and its aligned F scores use the joints' alignment.
+    `poem-release` has the metrics of `poem`, of joints regressed from the meshes of both sides (so `rr_` is
+    about the wrist of the own mesh); only `auc_j_20` and `auc_j_50` are of the joints given.
     Args:
         pred_joints: (n, 21, 3) metres, any frame, joint 0 the wrist (`sc_tr_` also reads joint 4 as given).
         gt_joints: (n, 21, 3) metres, the same frame and order.
         pred_vertices: (n, 778, 3) metres.
         gt_vertices: (n, 778, 3) metres.
-        protocol: 'poem', 'freihand', 'ho3d' or 'dexycb'.
+        protocol: 'poem', 'poem-release', 'freihand', 'ho3d' or 'dexycb'.
+        hand: whose regressor `poem-release` uses; the others need none.
     Returns: the metrics, in millimetres where the name says so, else shares in [0, 1].
     Raises:
         ValueError: unknown protocol, wrong or mismatched shape, no sample, or a number that is not finite.
@@ -70,7 +75,13 @@ def evaluate(
     _check_shapes(points, rules)
     pred = Hands(points["pred_joints"], points["pred_vertices"])
     gt = Hands(points["gt_joints"], points["gt_vertices"])
-    return _scores(pred, gt, rules)
+    if not rules.regresses_joints:
+        return _scores(pred, gt, rules)
+    if hand is None:
+        raise ValueError(f"protocol {protocol!r} regresses joints from vertices: give `hand`; got None")
+    direct = _set_scores(pred.joints, gt.joints, rules, "", "mpjpe_mm", "j")
+    areas = {name: value for name, value in direct.items() if name.startswith("auc")}
+    return _scores(_regressed(pred, hand), _regressed(gt, hand), rules) | areas
 
 
 def point_distances(
@@ -148,6 +159,12 @@ def _scores(pred: Hands, gt: Hands, rules: Protocol) -> dict[str, float]:
     if rules.has_scale_translation:
         scores |= _scale_translation_scores(pred, gt, rules)
     return scores
+
+
+def _regressed(hands: Hands, hand: HandModel) -> Hands:
+    """Replace the joints by those that the mesh implies."""
+    double = hand._replace(J_regressor=np.asarray(hand.J_regressor, np.float64))
+    return hands._replace(joints=joints_from_vertices(double, hands.vertices))
 
 
 def _set_scores(

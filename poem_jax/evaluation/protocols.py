@@ -3,8 +3,8 @@
 Sources: FreiHAND `eval.py` (lmb-freiburg/freihand), HO-3D `eval.py` (shreyashampali/ho3d), DexYCB
 `hpe_eval.py` (NVlabs/dex-ycb-toolkit), POEM-v2 `lib/metrics` (JubSteven/POEM-v2).
 
-A protocol says how points are compared, not which points: the joints are the caller's. The released POEM
-regresses them from the vertices of both sides for all but AUC; our benchmark passes the predicted joints.
+A protocol says how points are compared, not which points: the joints are the caller's. `poem-release` alone
+regresses them from the vertices of both sides, as the released POEM does, for all but the joints' areas.
 """
 
 from dataclasses import dataclass
@@ -38,6 +38,8 @@ class Protocol:
     has_scale_translation: bool = False
     accepts_other_meshes: bool = False
     """Whether a predicted mesh of another vertex count is scored (F only) instead of refused."""
+    regresses_joints: bool = False
+    """Whether joint errors are of joints regressed from both meshes; areas stay those of the joints given."""
 
     def auc_thresholds(self, limit_mm: int) -> Float[np.ndarray, " step"]:
         """Return the thresholds of the PCK curve up to `limit_mm`, in the protocol's own unit."""
@@ -53,6 +55,7 @@ PROTOCOLS = {
     protocol.name: protocol
     for protocol in (
         Protocol("poem", units_per_metre=1, auc_steps=20, has_f_scores=True),
+        Protocol("poem-release", units_per_metre=1, auc_steps=20, has_f_scores=True, regresses_joints=True),
         Protocol("freihand", units_per_metre=1, auc_steps=100, has_f_scores=True, accepts_other_meshes=True),
         Protocol(
             "ho3d",

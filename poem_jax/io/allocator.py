@@ -1,8 +1,8 @@
 """The allocator settings that a JAX program on a CPU wants, made before the program starts.
 
-glibc gives big buffers back to the system and maps them anew at every call, which costs page faults in every
-forward pass. The settings that keep them are read at the start of a process only, so the `poem` command starts
-itself once more. The library never does.
+glibc gives big buffers back to the system and maps them anew at every call: page faults in every forward
+pass. The settings that keep them are read when a process starts, so the `poem` command starts itself once
+more. The library never does.
 """
 
 import os

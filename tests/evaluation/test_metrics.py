@@ -6,6 +6,7 @@ import pytest
 from poem_jax.evaluation.alignment import align, align_by_joints, fit_similarity, scale_translation
 from poem_jax.evaluation.metrics import area_under_curve, evaluate, f_scores, pck_curve
 from poem_jax.evaluation.protocols import PROTOCOLS, find_protocol
+from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, NUM_VERTICES, WRIST
 
 NUM_SAMPLES = 6
@@ -53,7 +54,7 @@ def test_names_of_the_metrics(protocol: str, expected: set[str]) -> None:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_perfect_prediction(protocol: str) -> None:
-    got = evaluate(**hands(0, noise_m=0.0), protocol=protocol)
+    got = evaluate(**hands(0, noise_m=0.0), protocol=protocol, hand=default_hand())
     for name, value in got.items():
         if name.endswith("_mm"):
             assert value < 1e-5, name
@@ -90,8 +91,10 @@ def test_root_relative_errors_do_not_see_a_shift() -> None:
 def test_errors_move_with_the_frame_of_both_hands(protocol: str) -> None:
     points = hands(3)
     _, rotation, shift = similarity(4)
-    before = evaluate(**points, protocol=protocol)
-    after = evaluate(**{k: v @ rotation.T + shift for k, v in points.items()}, protocol=protocol)
+    before = evaluate(**points, protocol=protocol, hand=default_hand())
+    after = evaluate(
+        **{k: v @ rotation.T + shift for k, v in points.items()}, protocol=protocol, hand=default_hand()
+    )
     np.testing.assert_allclose([*after.values()], [*before.values()], rtol=1e-6)
 
 
@@ -154,7 +157,7 @@ def test_scale_translation_fixes_one_length_and_the_wrist() -> None:
 @pytest.mark.parametrize("protocol", ["freihand", "ho3d"])
 def test_another_mesh_scores_minus_one_and_is_moved_by_the_joints(protocol: str) -> None:
     points = hands(8)
-    whole = evaluate(**points, protocol=protocol)
+    whole = evaluate(**points, protocol=protocol, hand=default_hand())
     part = evaluate(**points | {"pred_vertices": points["pred_vertices"][:, :500]}, protocol=protocol)
     for name, value in part.items():
         if "mpvpe" in name or "auc_v" in name:
@@ -185,7 +188,9 @@ def test_lower_precision_is_raised_to_float64(dtype: type) -> None:
 
 class TestRefusals:
     def test_unknown_protocol(self) -> None:
-        with pytest.raises(ValueError, match=r"one of 'poem', 'freihand', 'ho3d', 'dexycb'; got 'frei'"):
+        with pytest.raises(
+            ValueError, match=r"one of 'poem', 'poem-release', 'freihand', 'ho3d', 'dexycb'; got 'frei'"
+        ):
             evaluate(**hands(0), protocol="frei")
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf])

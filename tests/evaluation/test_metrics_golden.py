@@ -19,6 +19,7 @@ from poem_jax.evaluation.metrics import (
     point_distances,
 )
 from poem_jax.evaluation.protocols import PROTOCOLS, find_protocol
+from poem_jax.hand.mano_file import load
 
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
 GOLDEN = REFERENCE / "metrics" / "official_golden.npz"
@@ -226,7 +227,8 @@ def test_every_key_of_the_golden_is_compared() -> None:
 
 
 def test_protocols_of_the_golden_are_all_known() -> None:
-    assert set(OFFICIAL_SCORES) == set(PROTOCOLS)
+    # The release's own evaluation has a golden of its own, below.
+    assert set(OFFICIAL_SCORES) == set(PROTOCOLS) - {"poem-release"}
 
 
 def test_the_dexycb_unit_shows_in_the_tenth_digit() -> None:
@@ -277,6 +279,25 @@ def test_release_errors_of_joints_of_the_mesh() -> None:
     np.testing.assert_allclose(got["rr_mpjpe_mm"], 1000 * numbers["RR_J_root0_from_mesh"], rtol=1e-6)
     expected = 1000 * numbers["RR_V_root0_from_mesh_joint"]
     np.testing.assert_allclose(got["rr_mpvpe_mm"], expected, rtol=1e-6)
+
+
+def test_the_protocol_of_the_release_regresses_its_joints() -> None:
+    """All numbers of the released evaluation from one call on direct joints and meshes."""
+    data, numbers = release()
+    hand = load(RELEASE_GOLDEN.parent / "fake_mano.npz")
+    points = [data[key] for key in ("pred_joints", "gt_joints", "pred_verts", "gt_verts")]
+    got = evaluate(*points, protocol="poem-release", hand=hand)
+    expected = {f"{name}_mm": 1000 * value for name, value in numbers["PAEval_from_mesh"].items()}
+    expected |= {
+        "rr_mpjpe_mm": 1000 * numbers["RR_J_root0_from_mesh"],
+        "rr_mpvpe_mm": 1000 * numbers["RR_V_root0_from_mesh_joint"],
+    }
+    expected |= {f"auc_{x}_{mm}": numbers[f"AUC_{x.upper()}_{mm}mm"] for x in "jv" for mm in (20, 50)}
+    for name, value in expected.items():
+        np.testing.assert_allclose(got[name], value, rtol=1e-5, err_msg=name)
+    np.testing.assert_allclose(got["mpjpe_mm"], 1000 * numbers["MPJPE_from_mesh"], rtol=1e-6)
+    with pytest.raises(ValueError, match="regresses joints from vertices: give `hand`"):
+        evaluate(*points, protocol="poem-release")
 
 
 def test_release_curves() -> None:
