@@ -5,7 +5,7 @@ recomputing residual chains inside large fusions. XLA:CPU, however, runs the gra
 a loop a hundred times slower than outside, so that training on a CPU unrolls the blocks.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -15,6 +15,12 @@ from flax import nnx
 from poem_jax.models.batch_norm import NormMode
 
 _Carry = TypeVar("_Carry")
+
+
+def stacked_axes(path: Sequence[str]) -> int:
+    """Count the leading axes, one per `Stack` around it, of the array at `path` in a model's parameters."""
+    blocks = [i for i, part in enumerate(path) if part == "blocks"]
+    return sum(not path[i + 1].isdigit() for i in blocks)
 
 
 class Stack(nnx.Module):

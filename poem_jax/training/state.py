@@ -1,11 +1,12 @@
 """What training carries from step to step, and the optimiser that moves it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from poem_jax.models.stack import stacked_axes
 from poem_jax.training.config import Clip, OptimizerConfig, Schedule, TrainConfig
 from poem_jax.typing import Array, Int, Params, PyTree
 
@@ -82,13 +83,17 @@ def _one_schedule(options: OptimizerConfig, peak: float, steps: int) -> optax.Sc
 
 
 def clip_each_tensor(max_norm: float) -> optax.GradientTransformation:
-    """Limit the norm of every gradient tensor on its own, as the release does (FACTS section 10)."""
+    """Limit the norm of every gradient tensor on its own, as the release does (FACTS section 10).
 
-    def clip(gradient: Array) -> Array:
-        norm = jnp.sqrt(jnp.sum(gradient**2))
+    Equal blocks whose weights are stacked in one array count as so many tensors.
+    """
+
+    def clip(path: Any, gradient: Array) -> Array:
+        axes = tuple(range(stacked_axes([part.key for part in path]), gradient.ndim))
+        norm = jnp.sqrt(jnp.sum(gradient**2, axes, keepdims=True))
         return gradient * jnp.minimum(1.0, max_norm / (norm + 1e-6))
 
-    return optax.stateless_with_tree_map(lambda gradient, _: clip(gradient))
+    return optax.stateless(lambda gradients, _: jax.tree_util.tree_map_with_path(clip, gradients))
 
 
 def update_average(average: Params, params: Params, step: Array, decay: float) -> Params:

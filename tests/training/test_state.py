@@ -44,6 +44,19 @@ def test_each_tensor_is_clipped_on_its_own():
     np.testing.assert_array_equal(clipped["small"], gradients["small"])
 
 
+def test_stacked_blocks_are_clipped_one_by_one():
+    """HRNet keeps equal blocks in one array, (module, block, ...), that the release has as many tensors."""
+    kernel = jnp.ones((2, 3, 4)) * jnp.array([0.1, 2.0, 0.2])[:, None]
+    nested = {"stage2": {"blocks": {"branches": {"0": {"blocks": {"kernel": kernel}}}}}}
+    clipped, _ = clip_each_tensor(1.0).update(nested, clip_each_tensor(1.0).init(nested))
+    found = clipped["stage2"]["blocks"]["branches"]["0"]["blocks"]["kernel"]
+    expected = kernel / jnp.maximum(jnp.linalg.norm(kernel, axis=-1, keepdims=True), 1.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    listed = {"stages": {"0": {"blocks": {"1": {"kernel": kernel}}}}}
+    clipped, _ = clip_each_tensor(1.0).update(listed, clip_each_tensor(1.0).init(listed))
+    assert jnp.linalg.norm(clipped["stages"]["0"]["blocks"]["1"]["kernel"]) == pytest.approx(1, rel=1e-5)
+
+
 @pytest.mark.parametrize("clip", list(Clip))
 def test_first_adam_step_has_the_learning_rate(micro_config, clip):
     config = with_optimizer(micro_config, clip=clip, schedule=Schedule.CONSTANT, learning_rate=0.25)
