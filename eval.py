@@ -15,6 +15,7 @@ import sys
 import time
 
 import jax
+import numpy as np
 
 from poem_jax.evaluation.benchmark import (
     DEFAULT_SEED,
@@ -27,10 +28,12 @@ from poem_jax.evaluation.benchmark import (
 from poem_jax.evaluation.protocols import PROTOCOLS
 from poem_jax.evaluation.tables import format_report, write_json
 from poem_jax.hand.model import HandModel
+from poem_jax.hand.template import default_hand
 from poem_jax.io.compilation_cache import use_compilation_cache
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.training.config import TrainConfig, load_experiment
+from poem_jax.typing import Params
 from poem_jax.weights.store import SHIPPED, load
 
 
@@ -89,7 +92,7 @@ def run(options: argparse.Namespace) -> dict[int, Scores]:
     _, params = load(weights, expected=config.model)
     captures = SyntheticDataset(captures_config(config), seed=options.seed)
     started = time.perf_counter()
-    hand = HandModel(**jax.device_get(params["constants"]["hand"]))
+    hand = own_hand(params)
     results = run_benchmark(model_predictor(params, config.model), captures, settings, hand)
     seconds = time.perf_counter() - started
     seen = ", which is the TRAINING seed" if options.seed == config.data.seed else ""
@@ -98,6 +101,21 @@ def run(options: argparse.Namespace) -> dict[int, Scores]:
     regressed = PROTOCOLS[options.protocol].regresses_joints
     print(format_report(results, regressed_joints=regressed))
     return results
+
+
+def own_hand(params: Params) -> HandModel:
+    """Return the model's hand, which must be that of the captures.
+
+    Raises:
+        ValueError: it is another one (MANO, say), whose vertices mean other places.
+    """
+    hand = HandModel(**jax.device_get(params["constants"]["hand"]))
+    if not np.allclose(hand.v_template, default_hand().v_template, atol=1e-6):
+        raise ValueError(
+            "synthetic captures show the hand of this package, and the model has another one, so that their "
+            "vertices cannot be compared; evaluate a model that was trained with the package's hand"
+        )
+    return hand
 
 
 def captures_config(config: TrainConfig) -> SyntheticConfig:

@@ -15,7 +15,12 @@ import jax.numpy as jnp
 
 from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.geometry.cameras import Cameras, anchor_to_primary, fill_masked_views, project
-from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.geometry.transforms import (
+    axis_angle_from_rotation,
+    matmul,
+    quaternion_from_rotation,
+    rotation_from_axis_angle,
+)
 from poem_jax.hand.model import HandModel, joints_from_vertices
 from poem_jax.hand.topology import ROOT_JOINT, QueryOrder, split_queries
 from poem_jax.typing import Array, Bool, Float
@@ -175,7 +180,7 @@ def multi_view_losses(
     terms = {
         **terms_2d,
         **layer_terms[-1],
-        **_parametric_terms(prediction, batch, sample_mask, recipe.pose_space, axis_name),
+        **_parametric_terms(prediction, batch, cameras, sample_mask, recipe.pose_space, axis_name),
     }
     loss = weighted(terms_2d, recipe)
     for term in layer_terms:
@@ -291,19 +296,51 @@ def _point_terms(
 
 
 def _parametric_terms(
-    prediction: Prediction, batch: MultiViewBatch, sample_mask: Array, space: PoseSpace, axis_name: str | None
+    prediction: Prediction,
+    batch: MultiViewBatch,
+    cameras: Cameras,
+    sample_mask: Array,
+    space: PoseSpace,
+    axis_name: str | None,
 ) -> dict[str, Array]:
-    """Compare pose and shape where both sides have them."""
+    """Compare pose and shape where both sides have them; poses in the primary camera's frame."""
     terms = {}
     if prediction.pose is not None and batch.pose is not None:
-        pose, truth = prediction.pose, jnp.asarray(batch.pose)
-        if space is PoseSpace.ROTATION:
-            pose, truth = rotation_from_axis_angle(pose), rotation_from_axis_angle(truth)
+        _, T_primary_from_world = anchor_to_primary(cameras.T_cam_from_world, cameras.view_mask)
+        pose, truth = (
+            _turned_rotations(T_primary_from_world, vectors) for vectors in (prediction.pose, batch.pose)
+        )
+        if space is PoseSpace.AXIS_ANGLE:
+            root = axis_angle_from_rotation(truth[:, :1])
+            pose, truth = released_axis_angle(pose), jnp.concatenate([root, batch.pose[:, 1:]], 1)
         terms["pose"] = masked_mean((pose - truth) ** 2, sample_mask, axis_name=axis_name)
     if prediction.shape is not None and batch.shape is not None:
         residual = prediction.shape - batch.shape
         terms["shape"] = masked_mean(residual**2, sample_mask, axis_name=axis_name)
     return terms
+
+
+def released_axis_angle(rotations: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
+    """Return the axis-angle vectors that the released parametric model compares (FACTS section 7).
+
+    They come from the quaternion whose largest component is positive, so that an angle may exceed pi: the
+    rotation that `axis_angle_from_rotation` gives too, but another number in a loss.
+    """
+    q = quaternion_from_rotation(rotations)
+    largest = jnp.take_along_axis(q, jnp.argmax(jnp.abs(q), -1)[..., None], -1)
+    turned = axis_angle_from_rotation(rotations)
+    # The other quaternion of the rotation: the same axis backwards, by 2 pi less the angle.
+    angle = jnp.sqrt(jnp.maximum(jnp.sum(turned**2, -1, keepdims=True), 1e-12))
+    return jnp.where(largest < 0, turned * (1 - 2 * jnp.pi / angle), turned)
+
+
+def _turned_rotations(
+    T_a_from_world: Float[Array, "batch 4 4"], pose: Float[Array, "batch 16 3"]
+) -> Float[Array, "batch 16 3 3"]:
+    """Return the joints' rotations, the first one into frame a."""
+    rotations = rotation_from_axis_angle(jnp.asarray(pose))
+    first = matmul(T_a_from_world[:, :3, :3], rotations[:, 0])
+    return jnp.concatenate([first[:, None], rotations[:, 1:]], 1)
 
 
 def _diagonal(image_hw: tuple[int, int]) -> float:

@@ -1,6 +1,5 @@
 """The model behind a reconstruction: loaded once, compiled once for one batch shape."""
 
-import functools
 import os
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -42,8 +41,7 @@ def load_engine(checkpoint: str | os.PathLike | None, batch_size: int) -> Engine
 
 def make_engine(config: Config, params: Params, batch_size: int, origin: str = "given") -> Engine:
     """Build an engine from a model in memory."""
-    run = functools.partial(run_packed, config=config)
-    return Engine(config, prepare(params, config), batch_size, run, origin)
+    return Engine(config, prepare(params, config), batch_size, run_packed, origin)
 
 
 def reconstruct_samples(engine: Engine, samples: Sequence[HandSample]) -> list[HandResult]:

@@ -137,6 +137,8 @@ class RootConfig:
     cell_offset: float = 0.5
     """Cell i stands for pixel `stride` x (i + `cell_offset`); the release has 0."""
     activation: HeatActivation = HeatActivation.SIGMOID
+    sum_epsilon: float = 0.0
+    """Added to a sigmoid map's sum before its expectation is divided by it; the release has 1e-6."""
     view_weights: ViewWeights = ViewWeights.EQUAL
     unit_rows: bool = True
     """Scale every row of the triangulation to unit norm; the release keeps raw pixels."""

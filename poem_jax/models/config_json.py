@@ -14,6 +14,8 @@ from poem_jax.models.config import Config, require
 
 _T = TypeVar("_T")
 _KIND = "kind"
+_MOVED = {"feature_stride": ("features", "stride"), "similarity": ("aggregation", "similarity")}
+"""Keys of the whole model that belong to one of its parts now; checkpoints of earlier versions have them."""
 
 
 def to_json(config: Config) -> str:
@@ -28,7 +30,17 @@ def from_json(text: str) -> Config:
         ValueError: unknown key, missing or unknown `kind`, a value of the wrong type, or one that breaks a
             rule of its dataclass.
     """
-    return _decode(json.loads(text), Config, "config")
+    return _decode(_at_their_new_place(json.loads(text)), Config, "config")
+
+
+def _at_their_new_place(values: Any) -> Any:
+    if not isinstance(values, dict):
+        return values
+    kept = {key: value for key, value in values.items() if key not in _MOVED}
+    for key, (part, name) in _MOVED.items():
+        if key in values:
+            kept[part] = {**kept.get(part, {}), name: values[key]}
+    return kept
 
 
 def _encode(value: Any, declared: Any) -> Any:
@@ -47,6 +59,8 @@ def _decode(value: Any, declared: Any, path: str) -> Any:
     if typing.get_origin(declared) is tuple:
         return _decode_tuple(value, typing.get_args(declared), path)
     if issubclass(declared, enum.Enum):
+        known = [member.value for member in declared]
+        require(value in known, f"`{path}` must be one of {known}; got {value!r}")
         return declared(value)
     # A bool is an int to Python; a whole number is a good float.
     accepted = (int, float) if declared is float else (declared,)

@@ -5,15 +5,18 @@ fixed size for the trunk, which is most of the work, and the hand is then found 
 cost follows the views that there are. All shapes are fixed by the padded batch: new masks compile nothing.
 
 On a CPU a chunk is one view, and as many threads as cores each run a program that uses one thread: XLA:CPU
-shares a single convolution badly among cores (measured on two: 106 GFLOP/s so, 158 with a view per thread, of
-187 that a matrix product reaches).
+shares a single convolution badly among cores. Programs for few and for many parts differ, so that a padded
+batch compiles at most two of each half. Accelerators take the chunks one after the other; nothing was
+measured there.
 """
 
+import contextlib
 import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,15 +41,16 @@ _VIEWS_AT_A_TIME = 8
 _ONE_THREAD = {"xla_cpu_multi_thread_eigen": False}
 """Compiler option for programs of which several run side by side."""
 
-_Result = TypeVar("_Result")
 
-
-class Prepared(NamedTuple):
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["params", "first"], meta_fields=["config"])
+@dataclass(frozen=True)
+class Prepared:
     """A model ready for inference: its parameters, and what does not depend on the images."""
 
     params: Params
     first: Surroundings | None
     """Whom the first decoder layer reads, and what the offsets contribute; None where samples differ."""
+    config: Config
 
 
 def prepare(params: Params, config: Config) -> Prepared:
@@ -56,7 +60,7 @@ def prepare(params: Params, config: Config) -> Prepared:
         ValueError: `params` of another config.
     """
     parameters.check_params(config, params)
-    return jax.device_put(Prepared(params, _first_surroundings(params, config)))
+    return jax.device_put(Prepared(params, _first_surroundings(params, config), config))
 
 
 def infer(
@@ -64,7 +68,6 @@ def infer(
     views: Num[Array, "batch view h w 3"],
     cams: Cameras,
     *,
-    config: Config,
     root_world: Float[Array, "batch 3"] | None = None,
 ) -> Prediction:
     """Do what `apply` does, faster: the same arguments, results and errors, for concrete inputs only.
@@ -77,8 +80,8 @@ def infer(
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((views, cams, root_world))):
         raise ValueError("`infer` looks at the values of its inputs; under jit, grad or vmap use `apply`")
-    check_inputs(views, cams, root_world, config)
-    return run_packed(prepared, views, cams, config=config, root_world=root_world)
+    check_inputs(views, cams, root_world, prepared.config)
+    return run_packed(prepared, views, cams, root_world=root_world)
 
 
 def run_packed(
@@ -86,20 +89,19 @@ def run_packed(
     views: Num[Array, "batch view h w 3"],
     cams: Cameras,
     *,
-    config: Config,
     root_world: Float[Array, "batch 3"] | None = None,
 ) -> Prediction:
     """Do what `infer` does without its checks: a sample that cannot be solved has `valid` False.
 
-    A view that is masked, or whose image or camera is not finite, is left out.
+    A view that is masked, or whose image or camera is not finite, is left out. On a CPU a sample without any
+    view costs nothing and is zero.
     """
     dtype = prepared.params["constants"]["basis_points"].dtype
     cams, root, origin = centre_world(cams, root_world, dtype)
     mask = np.asarray(cams.view_mask)
-    sound = (
-        mask & _finite_per_view(views) & _finite_per_view(cams.K) & _finite_per_view(cams.T_cam_from_world)
-    )
-    seen = _look_at_valid(prepared, np.asarray(views), sound, config)
+    finite = [_finite_per_view(values) for values in (views, cams.K, cams.T_cam_from_world)]
+    sound = functools.reduce(np.logical_and, finite, mask)
+    seen = _look_at_valid(prepared, np.asarray(views), sound)
     K, T_cam_from_world, _ = fill_masked_views(Cameras(cams.K, cams.T_cam_from_world, sound))
     if root is None:
         root = np.full((len(mask), 3), np.nan)
@@ -110,7 +112,7 @@ def run_packed(
         (sound == mask).all(-1),
         origin,
     )
-    return _find_hands(prepared, samples, config)
+    return _find_hands(prepared, samples)
 
 
 class _Samples(NamedTuple):
@@ -123,43 +125,69 @@ class _Samples(NamedTuple):
     origin: Origin
 
 
-def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray, config: Config) -> ViewFeatures:
+def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> ViewFeatures:
     """Run the trunk over the valid views, chunk by chunk; masked views get zeros."""
     packed = views[valid]
     chunk = 1 if _on_cpu() else _VIEWS_AT_A_TIME
     missing = -len(packed) % chunk
     packed = np.concatenate([packed, np.zeros((missing, *packed.shape[1:]), packed.dtype)])
-    look = _program(_look, config, one_thread=_on_cpu())
     chunks = [packed[start : start + chunk] for start in range(0, len(packed), chunk)]
-    buffers = _empty_features(config, views.dtype, valid.size + chunk)
-    for i, seen in enumerate(_side_by_side(lambda images: look(prepared, images), chunks)):
+    buffers = _empty_features(prepared, views.dtype, valid.size + chunk)
+    for i, seen in enumerate(_run_all(_look, prepared, chunks)):
         buffers = _write(buffers, seen, i * chunk)
     place = np.where(valid, np.cumsum(valid).reshape(valid.shape) - 1, valid.size)
     return _read(buffers, place)
 
 
-def _find_hands(prepared: Prepared, samples: _Samples, config: Config) -> Prediction:
-    """Run the second half: on accelerators the whole batch at once, on a CPU each sample in a thread."""
-    batch = len(samples.root)
-    size = 1 if _on_cpu() else batch
-    find = _program(_find, config, one_thread=_on_cpu() and batch > 1)
-    parts = [
-        jax.tree.map(lambda leaf, start=start: leaf[start : start + size], samples)
-        for start in range(0, batch, size)
+def _find_hands(prepared: Prepared, samples: _Samples) -> Prediction:
+    """Run the second half: on accelerators the whole batch at once, on a CPU sample by sample."""
+    if not _on_cpu():
+        return _batch_second(_find(prepared, samples))
+    rows = np.flatnonzero(samples.cams.view_mask.any(-1)) if samples.cams.view_mask.any() else np.array([0])
+    parts = [jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], samples) for row in rows]
+    found = dict(zip(rows.tolist(), _run_all(_find, prepared, parts), strict=True))
+    empty = jax.tree.map(jnp.zeros_like, found[int(rows[0])])
+    ordered = [found.get(row, empty) for row in range(len(samples.root))]
+    return _batch_second(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ordered))
+
+
+def _batch_second(found: Prediction) -> Prediction:
+    return found._replace(layers_world=jnp.moveaxis(found.layers_world, 0, 1))
+
+
+def _run_all(function: Callable, prepared: Prepared, parts: list) -> list:
+    """Apply a function of (prepared, part) to all parts.
+
+    On a CPU they run side by side, one thread each, if that keeps more than half of the cores busy;
+    otherwise, and on accelerators, one after the other.
+    """
+    cores = _cores()
+    if not _on_cpu() or 2 * len(parts) <= cores:
+        return [function(prepared, part) for part in parts]
+    program, settings = _one_thread(function), _thread_settings()
+
+    def work(part: Any) -> Any:
+        with contextlib.ExitStack() as stack:
+            for setting in settings:
+                stack.enter_context(setting())
+            # Waiting inside the thread is what keeps one program in each.
+            return jax.block_until_ready(program(prepared, part))
+
+    with ThreadPoolExecutor(min(cores, len(parts))) as pool:
+        return list(pool.map(work, parts))
+
+
+def _thread_settings() -> list[Callable[[], Any]]:
+    """Return what re-enters the caller's JAX settings, which a new thread does not inherit."""
+    values = jax.config.values
+    x64, precision, device = (
+        values[name] for name in ("jax_enable_x64", "jax_default_matmul_precision", "jax_default_device")
+    )
+    return [
+        lambda: jax.enable_x64(x64),
+        lambda: jax.default_matmul_precision(precision),
+        lambda: jax.default_device(device),
     ]
-    found = _side_by_side(lambda part: find(prepared, part), parts)
-    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
-    return joined._replace(layers_world=jnp.moveaxis(joined.layers_world, 0, 1))
-
-
-def _side_by_side(work: Callable[[Any], _Result], parts: list) -> list[_Result]:
-    """Apply `work` to all parts: in one thread a core on a CPU, in order on an accelerator."""
-    threads = min(_cores() if _on_cpu() else 1, len(parts))
-    if threads <= 1:
-        return [work(part) for part in parts]
-    with ThreadPoolExecutor(threads) as pool:
-        # Waiting inside the thread is what keeps one program in each.
-        return list(pool.map(lambda part: jax.block_until_ready(work(part)), parts))
 
 
 def _cores() -> int:
@@ -172,14 +200,17 @@ def _on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def _look(prepared: Prepared, images: Array, *, config: Config) -> ViewFeatures:
-    model = parameters.assemble(config, prepared.params)
+@jax.jit
+def _look(prepared: Prepared, images: Array) -> ViewFeatures:
+    model = parameters.assemble(prepared.config, prepared.params)
     dtype = prepared.params["constants"]["basis_points"].dtype
-    return model.look(normalised_images(images, config, dtype), NormMode())
+    return model.look(normalised_images(images, prepared.config, dtype), NormMode())
 
 
-def _find(prepared: Prepared, samples: _Samples, *, config: Config) -> Prediction:
+@jax.jit
+def _find(prepared: Prepared, samples: _Samples) -> Prediction:
     """Find the hands; `layers_world` with the batch axis first, like all the rest."""
+    config = prepared.config
     model = parameters.assemble(config, prepared.params)
     frame = enter_primary_frame(samples.cams, samples.root)
     result = model.reconstruct(samples.seen, frame.cams, frame.root, NormMode(), prepared.first)
@@ -190,23 +221,21 @@ def _find(prepared: Prepared, samples: _Samples, *, config: Config) -> Predictio
     return prediction._replace(layers_world=jnp.moveaxis(prediction.layers_world, 1, 0))
 
 
+@functools.cache
+def _one_thread(function: Callable) -> Callable:
+    """Return a jitted function compiled to run in one thread."""
+    return jax.jit(function.__wrapped__, compiler_options=_ONE_THREAD)  # pyright: ignore[reportFunctionMemberAccess]
+
+
 @functools.partial(jax.jit, static_argnames="config")
 def _first_surroundings(params: Params, config: Config) -> Surroundings | None:
     return parameters.assemble(config, params).prepared_surroundings()
 
 
-@functools.lru_cache(maxsize=32)
-def _program(function: Callable, config: Config, one_thread: bool) -> Callable:
-    """Return the jitted function of (prepared, batch) for one model."""
-    options = _ONE_THREAD if one_thread else None
-    return jax.jit(functools.partial(function, config=config), compiler_options=options)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _empty_features(config: Config, image_dtype: np.dtype, count: int) -> ViewFeatures:
-    described = parameters.describe(config)
-    image = jax.ShapeDtypeStruct((1, *config.image_hw, 3), image_dtype)
-    shapes = jax.eval_shape(functools.partial(_look, config=config), Prepared(described, None), image)
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _empty_features(prepared: Prepared, image_dtype: np.dtype, count: int) -> ViewFeatures:
+    image = jax.ShapeDtypeStruct((1, *prepared.config.image_hw, 3), image_dtype)
+    shapes = jax.eval_shape(_look, prepared, image)
     return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), shapes)
 
 

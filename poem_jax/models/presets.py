@@ -41,7 +41,7 @@ V2_PARAM = replace(V2_BASE, decoder=DecoderConfig(output=DecoderOutput.HAND_PARA
 
 V2_MEDIUM_RELEASE = Config(
     branch_bias=True,
-    root=RootConfig(num_joints=NUM_JOINTS, pooling=2, cell_offset=0.0, unit_rows=False),
+    root=RootConfig(num_joints=NUM_JOINTS, pooling=2, cell_offset=0.0, sum_epsilon=1e-6, unit_rows=False),
     features=FeatureConfig(
         stride=16, fusion=FeatureFusion.BOTTOM_UP, position_code=PositionCode.VIEW_ROW_COLUMN
     ),

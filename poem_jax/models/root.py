@@ -20,7 +20,7 @@ class HeatMapBranch(nnx.Module):
         self, config: RootConfig, trunk: HRNetConfig | ResNetConfig, *, bias: bool = False, rngs: nnx.Rngs
     ) -> None:
         self.stride, self.cell_offset = config.stride, config.cell_offset
-        self.pooling = config.pooling
+        self.pooling, self.sum_epsilon = config.pooling, config.sum_epsilon
         self.branch = TopDownBranch(trunk.channels, trunk.strides, config.branch_stride, bias=bias, rngs=rngs)
         self.to_logits = Conv(self.branch.c_out, config.num_joints, 1, bias=True, rngs=rngs)
         self.activation = config.activation
@@ -33,11 +33,14 @@ class HeatMapBranch(nnx.Module):
         if self.activation is HeatActivation.SOFTMAX:
             heat = jax.nn.softmax(logits, axis=(-2, -1))
         else:
-            # Of logarithms, so that a map of very low logits is not 0 / 0. The release adds 1e-6 to the sum,
-            # which is below float32's resolution for any map that sees something.
+            # Of logarithms, so that a map of very low logits is not 0 / 0.
             heat = jax.nn.softmax(jax.nn.log_sigmoid(logits), axis=(-2, -1))
         # `soft_argmax` takes a cell's centre for its position.
-        return self.stride * (soft_argmax(heat) + (self.cell_offset - 0.5)), heat
+        keypoints = self.stride * (soft_argmax(heat) + (self.cell_offset - 0.5))
+        if self.sum_epsilon:
+            total = jnp.sum(jax.nn.sigmoid(logits), (-2, -1))[..., None]
+            keypoints = keypoints * (total / (total + self.sum_epsilon))
+        return keypoints, heat
 
 
 def spread(heat_maps: Float[Array, "*batch h w"]) -> Float[Array, "*batch"]:

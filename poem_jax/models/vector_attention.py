@@ -23,9 +23,6 @@ from poem_jax.geometry.neighbours import nearest
 from poem_jax.models.linear import Linear
 from poem_jax.typing import Array, Float, Int
 
-_MAX_LOGIT = 60.0
-"""Logits are taken relative to those of the first neighbour; exp(60) is far from overflow in float32."""
-
 
 class Deltas(NamedTuple):
     """What the offsets to the neighbours contribute: G xi_2 h_ij and xi_2 h_ij."""
@@ -55,6 +52,14 @@ def nearest_neighbours(
 def anchored(index: Int[Array, " k"], positions: Float[Array, "k 3"]) -> Neighbours:
     """Let every query read the same rows, which count as standing at `positions` (batch 1)."""
     return Neighbours(jnp.asarray(index)[:, None, None], jnp.asarray(positions)[:, None, None])
+
+
+class _Sums(NamedTuple):
+    """Of the neighbours visited so far, relative to exp(largest)."""
+
+    largest: Float[Array, "batch query c"]
+    denominator: Float[Array, "batch query c"]
+    numerator: Float[Array, "batch query c"]
 
 
 class VectorAttention(nnx.Module):
@@ -146,21 +151,21 @@ def _rows(
 def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]:
     """Return sum_j softmax_j(logits) * values over the visits.
 
-    A softmax may be taken relative to any reference; the first (nearest) neighbour's logits serve, so that
-    the sums need no first pass for a maximum and the denominator is at least 1.
+    The sums are kept relative to the largest logit so far (Milakov and Gimelshein 2018, online softmax),
+    which has no derivative: the quotient does not depend on it.
     """
-    first = jax.tree.map(lambda leaf: leaf[0], neighbours)
-    reference = jax.lax.stop_gradient(visit(first)[0])
 
     @jax.checkpoint  # pyright: ignore[reportPrivateImportUsage]
-    def weighted(neighbour: Neighbours) -> tuple[Array, Array]:
+    def add(sums: _Sums, neighbour: Neighbours) -> _Sums:
         logits, values = visit(neighbour)
-        weight = jnp.exp(jnp.minimum(logits - reference, _MAX_LOGIT))
-        return weight, weight * values
+        largest = jnp.maximum(sums.largest, jax.lax.stop_gradient(logits))
+        kept, weight = jnp.exp(sums.largest - largest), jnp.exp(logits - largest)
+        return _Sums(largest, kept * sums.denominator + weight, kept * sums.numerator + weight * values)
 
-    def add(sums: tuple[Array, Array], neighbour: Neighbours) -> tuple[tuple[Array, Array], None]:
-        return jax.tree.map(jnp.add, sums, weighted(neighbour)), None
-
-    zero = jnp.zeros_like(reference)
-    (denominator, numerator), _ = jax.lax.scan(add, (zero, zero), neighbours)
-    return numerator / denominator
+    logits, values = visit(jax.tree.map(lambda leaf: leaf[0], neighbours))
+    largest = jax.lax.stop_gradient(logits)
+    weight = jnp.exp(logits - largest)  # one, but not to its derivative
+    first = _Sums(largest, weight, weight * values)
+    rest = jax.tree.map(lambda leaf: leaf[1:], neighbours)
+    sums, _ = jax.lax.scan(lambda sums, neighbour: (add(sums, neighbour), None), first, rest)
+    return sums.numerator / sums.denominator

@@ -4,7 +4,7 @@
 only, every gradient tensor clipped on its own, noise shared by the batch, a tenfold drop of the rate at 70 %.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from poem_jax import losses
@@ -45,16 +45,21 @@ RELEASE = Recipe(
         learning_rate=1e-4, schedule=Schedule.STEP, drop_at=0.7, clip=Clip.PER_TENSOR, clip_norm=1.0
     ),
 )
-RECIPES = {recipe.name: recipe for recipe in (PAPER, RELEASE)}
+RELEASE_MANO = replace(
+    RELEASE,
+    name="release-mano",
+    optimizer=replace(RELEASE.optimizer, schedule=Schedule.COSINE, final_ratio=0.001),
+)
+"""The released parametric model had a cosine down to 1e-7."""
+RECIPES = {recipe.name: recipe for recipe in (PAPER, RELEASE, RELEASE_MANO)}
 
 
 def experiment(recipe: str, **rest: Any) -> TrainConfig:
     """Make an experiment that follows a recipe.
 
     Args:
-        recipe: `"paper"` or `"release"`.
-        rest: the other fields of `TrainConfig`; one that the recipe sets may be given to replace it (the
-            released parametric model, for one, had a cosine schedule).
+        recipe: `"paper"`, `"release"` or, for the parametric model, `"release-mano"`.
+        rest: the other fields of `TrainConfig`; one that the recipe sets may be given to replace it.
 
     Raises:
         ValueError: no recipe of that name.

@@ -18,7 +18,7 @@ from poem_jax.models.presets import preset
 from poem_jax.typing import Float, Int
 from poem_jax.weights import store
 from poem_jax.weights.release_keys import hand_prefixes, live_entries
-from poem_jax.weights.torch_import import check_anchors, convert, export_state_dict
+from poem_jax.weights.torch_import import VARIANTS, check_anchors, convert, export_state_dict
 
 BASIS_FILE, ANCHOR_FILE, INDEX_FILE = "bps.npy", "anchor.npy", "anchor_idx.npy"
 _READ_OF_A_HAND = set(HandModel._fields) - {"faces", "is_left"}
@@ -63,20 +63,22 @@ def import_release(
         mano: `MANO_RIGHT.pkl`, or an `.npz` with MANO's names.
         assets: folder with `bps.npy`, `anchor.npy`, `anchor_idx.npy`.
         out: folder to make; on failure nothing is left there, and what stood there stays.
-        accept_anchors: take anchors that do not lie on the template of `mano`.
+        accept_anchors: take anchors that do not lie on the template of the checkpoint's hand.
         overwrite: replace the model folder at `out`.
 
     Raises:
         FileNotFoundError: a file is missing.
         ValueError: files that are damaged, hostile or do not belong together, or `out` exists.
     """
+    if variant not in VARIANTS:
+        raise ValueError(f"`variant` must be one of {', '.join(VARIANTS)}; got {variant!r}")
     out, config = Path(out), preset(f"{variant}-release")
     _check_folder(out, overwrite)
     hand, constants = mano_file.load(mano), read_assets(assets, config)
     state = load_state_dict(checkpoint)
     _, params = convert(state, variant, mano=hand, **constants._asdict())
     if not accept_anchors:
-        check_anchors(hand, config, constants.anchor_points)
+        check_anchors(config, params)
     store.save(out, config, params, overwrite=overwrite)
     num_read = _num_read(state, config)
     num_parameters = sum(leaf.size for leaf in jax.tree.leaves(params["trainable"]))

@@ -6,7 +6,7 @@ hold the MANO asset (`hand_prefixes`).
 
 from collections.abc import Iterator
 
-from poem_jax.hand.topology import NUM_QUERIES, NUM_SHAPES, NUM_SKELETON_JOINTS
+from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, NUM_SHAPES, NUM_SKELETON_JOINTS
 from poem_jax.models.config import Config, DecoderOutput, HRNetConfig
 from poem_jax.weights.entries import Entries, Entry, conv_norm, convolution, layer_norm, linear
 from poem_jax.weights.trunk_keys import hrnet_entries
@@ -124,7 +124,7 @@ def _dead_trunk(config: Config) -> Shapes:
     yield from _layer(f"{TRUNK}final_layer.0", (2048, 1024, 1, 1))
     yield from _norm(f"{TRUNK}final_layer.1", 2048)
     yield from _layer(f"{TRUNK}classifier", (1000, 2048))
-    yield from _layer("uv_in.conv", (channels[1], 21, 1, 1))
+    yield from _layer("uv_in.conv", (channels[1], NUM_JOINTS, 1, 1))
     yield from _norm("uv_in.norm", channels[1])
 
 

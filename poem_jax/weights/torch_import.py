@@ -11,8 +11,16 @@ import numpy as np
 
 from poem_jax.hand import mano_file
 from poem_jax.hand.model import HandModel
-from poem_jax.hand.topology import NUM_QUERIES
+from poem_jax.hand.topology import (
+    NUM_FACES,
+    NUM_POSE_FEATURES,
+    NUM_QUERIES,
+    NUM_SHAPES,
+    NUM_SKELETON_JOINTS,
+    NUM_VERTICES,
+)
 from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
+from poem_jax.models.parameters import describe
 from poem_jax.models.presets import preset
 from poem_jax.models.reconstruction import template_queries
 from poem_jax.typing import Float, Int, Params
@@ -32,16 +40,16 @@ VARIANTS = ("v2-small", "v2-medium", "v2-large", "v2-medium-mano")
 
 _SHOWN = 12
 _SAME_HAND_M = 1e-6
-_WORD_TABLE = 30522
+_ON_TEMPLATE_M = 1e-4
 _BUFFERS = {
-    "th_betas": (1, 10),
-    "th_shapedirs": (778, 3, 10),
-    "th_posedirs": (778, 3, 135),
-    "th_v_template": (1, 778, 3),
-    "th_J_regressor": (16, 778),
-    "th_weights": (778, 16),
-    "th_faces": (1538, 3),
-    "th_hands_mean": (1, 45),
+    "th_betas": (1, NUM_SHAPES),
+    "th_shapedirs": (NUM_VERTICES, 3, NUM_SHAPES),
+    "th_posedirs": (NUM_VERTICES, 3, NUM_POSE_FEATURES),
+    "th_v_template": (1, NUM_VERTICES, 3),
+    "th_J_regressor": (NUM_SKELETON_JOINTS, NUM_VERTICES),
+    "th_weights": (NUM_VERTICES, NUM_SKELETON_JOINTS),
+    "th_faces": (NUM_FACES, 3),
+    "th_hands_mean": (1, 3 * (NUM_SKELETON_JOINTS - 1)),
 }
 """What the hand layer of the released code keeps of a MANO file."""
 _IGNORED_ENDINGS = ("embeddings.position_ids",)
@@ -85,7 +93,7 @@ def convert(
         raise ValueError(f"`variant` must be one of {', '.join(VARIANTS)}; got {variant!r}")
     config = preset(f"{variant}-release")
     hand = _right_hand(mano)
-    state = {name.removeprefix("module."): np.asarray(array) for name, array in state_dict.items()}
+    state = _without_prefix(state_dict)
     leaves, problems = read_entries(list(live_entries(config)), state, expected_leaves(config))
     problems += _unknown_or_unlike(state, config)
     if problems:
@@ -131,7 +139,7 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: P
         ValueError: all names that are missing or unknown and arrays of another shape.
     """
     trunk: HRNetConfig | ResNetConfig = config.backbone
-    state = {name.removeprefix("module."): np.asarray(array) for name, array in state_dict.items()}
+    state = _without_prefix(state_dict)
     entries = list(trunk_entries(trunk))
     leaves, problems = read_entries(entries, state, expected_leaves(config))
     known = {entry.source for entry in entries}
@@ -149,24 +157,31 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: P
     return unflatten({**flatten(params), **leaves}, params)
 
 
-def check_anchors(hand: HandModel, config: Config, anchor_points: Float[np.ndarray, "*one anchor 3"]) -> None:
-    """Insist that the anchors lie on the template of a hand, as the release's do on MANO's.
+def check_anchors(config: Config, params: Params) -> None:
+    """Insist that the anchors of an imported model stand where its template has the points that they name.
 
     Raises:
         ValueError: they do not; the hand is another one than the weights were trained with.
     """
-    template = template_queries(hand, config.decoder.query_order) / config.basis.radius
-    anchors = np.asarray(anchor_points, np.float32).reshape(-1, 3)
-    gaps = np.linalg.norm(anchors[:, None] - template, axis=-1).min(1) * config.basis.radius
+    constants = params["constants"]
+    anchors, radius = constants["anchors"], config.basis.radius
+    places = np.asarray(constants["template_queries"])[np.asarray(anchors["index"])]
+    gaps = np.linalg.norm(radius * np.asarray(anchors["positions"]) - places, axis=-1)
     if gaps.max() > _ON_TEMPLATE_M:
         raise ValueError(
             f"the anchors must lie on the template of the hand; {int((gaps > _ON_TEMPLATE_M).sum())} of "
-            f"{len(anchors)} are up to {1000 * gaps.max():.1f} mm away. Give the MANO_RIGHT.pkl that the "
-            "weights were trained with, or accept other anchors with --accept-anchors"
+            f"{len(gaps)} are up to {1000 * gaps.max():.1f} mm away. Give the anchors and the checkpoint "
+            "of one release, or accept other anchors with --accept-anchors"
         )
 
 
-_ON_TEMPLATE_M = 1e-4
+def _without_prefix(state_dict: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Take `module.`, which parallel training adds, off all names."""
+    state = {name.removeprefix("module."): np.asarray(array) for name, array in state_dict.items()}
+    if len(state) < len(state_dict):
+        twice = sorted(name for name in state if name in state_dict and f"module.{name}" in state_dict)
+        raise ValueError(f"names must differ beyond the prefix `module.`; got these twice: {_shown(twice)}")
+    return state
 
 
 def _right_hand(mano: HandModel | str | Path) -> HandModel:
@@ -260,12 +275,12 @@ def _carried_hand(state: dict[str, np.ndarray], prefix: str, hand: HandModel) ->
         name: state[f"{prefix}th_{name}"].astype(np.float32).reshape(getattr(hand, name).shape)
         for name in ("v_template", "shapedirs", "posedirs", "J_regressor", "weights")
     }
-    gap = np.abs(fields["v_template"] - hand.v_template).max()
-    if gap > _SAME_HAND_M:
+    gaps = {name: float(np.abs(field - getattr(hand, name)).max()) for name, field in fields.items()}
+    if max(gaps.values()) > _SAME_HAND_M:
         _log.warning(
-            "the hand in %s differs from `mano` by up to %.2f mm; that of the weights is used",
+            "the hand in %s differs from `mano` (%s); that of the weights is used",
             prefix,
-            1000 * gap,
+            ", ".join(f"{name} by up to {gap:.2g}" for name, gap in gaps.items() if gap > _SAME_HAND_M),
         )
     if np.any(state[f"{prefix}th_hands_mean"]):
         _log.warning(
@@ -312,8 +327,6 @@ def _params(config: Config, leaves: dict[str, np.ndarray]) -> Params:
     template = expected_leaves(config)
     missing = template.keys() - leaves.keys()
     assert not missing, f"the table fills no {sorted(missing)}"
-    from poem_jax.models.parameters import describe
-
     return unflatten(
         {name: leaves[name].astype(leaf.dtype) for name, leaf in template.items()}, describe(config)
     )

@@ -18,8 +18,8 @@ from poem_jax.capture.take import hand_names
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
-from poem_jax.models.inference import Prepared
 from poem_jax.io.meshes import read_mesh
+from poem_jax.models.inference import Prepared
 from poem_jax.viz.overlay import MeshInView, silhouette
 
 
@@ -271,7 +271,7 @@ def stub_engine(vertices, joints, root, valid=True):
 
     config = types.SimpleNamespace(image_hw=(64, 64))
     params = {"constants": {"hand": {"faces": default_hand().faces}}}
-    return Engine(config, Prepared(params, None), len(vertices), answer, "stub")
+    return Engine(config, Prepared(params, None, config), len(vertices), answer, "stub")
 
 
 def known_hands(shift=0.0):

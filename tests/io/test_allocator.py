@@ -25,6 +25,13 @@ def test_a_program_starts_itself_once_with_the_settings(given, expected):
     assert printed == f"{expected} ['a', '--b c']\n"
 
 
+def test_a_lost_setting_is_not_asked_for_again(monkeypatch):
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    monkeypatch.setenv("POEM_JAX_RESTARTED", "1")
+    monkeypatch.setattr(allocator.os, "execv", lambda *_: pytest.fail("must not restart"))
+    allocator.restart_with_settings()
+
+
 def test_systems_without_glibc_go_on(monkeypatch):
     monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
     monkeypatch.setattr(allocator.platform, "libc_ver", lambda: ("", ""))

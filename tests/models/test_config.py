@@ -46,8 +46,16 @@ def test_unknown_trunk_fails():
 def test_unknown_choice_fails():
     text = json.loads(to_json(preset("tiny")))
     text["aggregation"]["similarity"] = "cosine"
-    with pytest.raises(ValueError, match="'cosine' is not a valid Similarity"):
+    message = r"`config.aggregation.similarity` must be one of \['dot', 'mean'\]; got 'cosine'"
+    with pytest.raises(ValueError, match=message):
         from_json(json.dumps(text))
+
+
+def test_configs_of_earlier_versions_are_read():
+    text = json.loads(to_json(preset("tiny")))
+    text["similarity"] = text.pop("aggregation")["similarity"]
+    text["feature_stride"] = text.pop("features")["stride"]
+    assert from_json(json.dumps(text)) == preset("tiny")
 
 
 @pytest.mark.parametrize(

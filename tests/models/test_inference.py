@@ -76,7 +76,7 @@ def test_infer_finds_what_apply_finds(model, make_scene):
     views, cams = make_scene(3, 4)
     cams = cams._replace(view_mask=MASK)
     expected = apply(params, views, cams, config=config)
-    found = infer(prepare(params, config), views, cams, config=config)
+    found = infer(prepare(params, config), views, cams)
     assert found._fields == expected._fields
     for name in ("vertices_world", "joints_world", "root_world", "layers_world", "translation", "shape"):
         if getattr(expected, name) is not None:
@@ -88,27 +88,63 @@ def test_infer_finds_what_apply_finds(model, make_scene):
     assert not np.any(found.heat_maps[~MASK])
 
 
-def test_the_trunk_sees_only_the_views_that_exist(micro_config, make_params, make_scene, monkeypatch):
-    seen = []
-    inner = inference._side_by_side
+def test_only_views_and_samples_that_exist_cost_anything(micro_config, make_params, make_scene, monkeypatch):
+    seen, inner = [], inference._run_all
     monkeypatch.setattr(
-        inference, "_side_by_side", lambda work, parts: seen.append(len(parts)) or inner(work, parts)
+        inference, "_run_all", lambda f, prepared, parts: seen.append(len(parts)) or inner(f, prepared, parts)
     )
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
-    infer(prepared, views, cams._replace(view_mask=MASK), config=micro_config)
-    assert seen == [MASK.sum(), len(MASK)]
+    mask = MASK & np.array([[True], [False], [True]])
+    found = inference.run_packed(prepared, views, cams._replace(view_mask=mask))
+    assert seen == [mask.sum(), 2]
+    np.testing.assert_array_equal(found.valid, [True, False, True])
+    assert not np.any(found.vertices_world[1])
+    nothing = inference.run_packed(prepared, views, cams._replace(view_mask=np.zeros((3, 4), bool)))
+    assert not nothing.valid.any()
+    assert np.isfinite(nothing.vertices_world).all()
 
 
-def test_new_masks_compile_nothing(micro_config, make_params, make_scene):
+@pytest.mark.parametrize("cores", [1, 2, 64])
+def test_threads_change_nothing(micro_config, make_params, make_scene, monkeypatch, cores):
+    views, cams = make_scene(2, 4)
+    prepared = prepare(make_params(micro_config), micro_config)
+    expected = infer(prepared, views, cams)
+    monkeypatch.setattr(inference, "_cores", lambda: cores)
+    np.testing.assert_allclose(infer(prepared, views, cams).layers_world, expected.layers_world, atol=METRES)
+
+
+def test_accelerators_take_padded_chunks(micro_config, make_params, make_scene, monkeypatch):
+    views, cams = make_scene(3, 4)
+    cams = cams._replace(view_mask=MASK)
+    prepared = prepare(make_params(micro_config), micro_config)
+    expected = infer(prepared, views, cams)
+    monkeypatch.setattr(inference, "_on_cpu", lambda: False)
+    np.testing.assert_allclose(infer(prepared, views, cams).layers_world, expected.layers_world, atol=METRES)
+
+
+def test_threads_keep_the_settings_of_the_caller(micro_config, make_params, make_scene, monkeypatch):
+    monkeypatch.setattr(inference, "_cores", lambda: 2)
+    views, cams = make_scene(2, 4)
+    with jax.enable_x64(True):
+        double = jax.tree.map(
+            lambda leaf: leaf.astype(np.float64) if leaf.dtype == np.float32 else leaf,
+            make_params(micro_config),
+        )
+        found = infer(prepare(double, micro_config), views / 255.0, cams)
+    assert found.vertices_world.dtype == np.float64
+
+
+def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkeypatch):
+    monkeypatch.setattr(inference, "_cores", lambda: 2)
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
-    infer(prepared, views, cams._replace(view_mask=MASK), config=micro_config)
-    jitted = [inference._program(inference._look, micro_config, True)]
-    jitted += [inference._program(inference._find, micro_config, True), inference._write, inference._read]
+    infer(prepared, views, cams._replace(view_mask=MASK))
+    jitted = [inference._one_thread(inference._look), inference._one_thread(inference._find)]
+    jitted += [inference._look, inference._find, inference._write, inference._read]
     before = [program._cache_size() for program in jitted]
     for mask in (~MASK | np.array([True, True, False, False]), np.ones((3, 4), bool)):
-        infer(prepared, views, cams._replace(view_mask=mask), config=micro_config)
+        infer(prepared, views, cams._replace(view_mask=mask))
     assert [program._cache_size() for program in jitted] == before
 
 
@@ -117,9 +153,9 @@ def test_single_views_take_their_known_root(micro_config, make_params, make_scen
     cams = cams._replace(view_mask=np.array([[0, 0, 1, 0], [1, 1, 1, 1]], bool))
     prepared = prepare(make_params(micro_config), micro_config)
     with pytest.raises(ValueError, match=r"needs `root_world`.*samples \[0\]"):
-        infer(prepared, views, cams, config=micro_config)
+        infer(prepared, views, cams)
     root = np.array([[0.01, -0.02, 0.03], [np.nan] * 3], np.float32)
-    found = infer(prepared, views, cams, config=micro_config, root_world=root)
+    found = infer(prepared, views, cams, root_world=root)
     assert found.valid.all()
     np.testing.assert_allclose(found.root_world[0], root[0], atol=1e-6)
 
@@ -129,7 +165,7 @@ def test_broken_views_are_left_out_and_flagged(micro_config, make_params, make_s
     K = cams.K.copy()
     K[0, 1, 0, 0] = np.nan
     prepared = prepare(make_params(micro_config), micro_config)
-    found = inference.run_packed(prepared, views, cams._replace(K=K), config=micro_config)
+    found = inference.run_packed(prepared, views, cams._replace(K=K))
     np.testing.assert_array_equal(found.valid, [False, True])
     assert np.isfinite(found.vertices_world).all()
 
@@ -138,6 +174,6 @@ def test_traces_and_other_parameters_are_refused(micro_config, parametric_config
     views, cams = make_scene(2, 4)
     prepared = prepare(make_params(micro_config), micro_config)
     with pytest.raises(ValueError, match="under jit, grad or vmap use `apply`"):
-        jax.jit(lambda v: infer(prepared, v, cams, config=micro_config))(views)
+        jax.jit(lambda v: infer(prepared, v, cams))(views)
     with pytest.raises(ValueError, match="do not belong to `config`"):
         prepare(make_params(micro_config), parametric_config)

@@ -34,6 +34,14 @@ def test_fields_of_a_recipe_can_be_replaced():
     assert experiment("release", **REST, optimizer=optimizer).optimizer is optimizer
 
 
+def test_the_parametric_release_ends_at_a_thousandth_of_its_rate():
+    config = experiment("release-mano", **REST)
+    assert learning_rate(config)(config.train.steps) == pytest.approx(1e-7, rel=0.01)
+    assert config.loss is losses.RELEASE
+
+
 def test_unknown_recipes_are_named():
-    with pytest.raises(ValueError, match=r"`recipe` must be one of \['paper', 'release'\]; got 'mine'"):
+    with pytest.raises(
+        ValueError, match=r"`recipe` must be one of \['paper', 'release', 'release-mano'\]; got 'mine'"
+    ):
         experiment("mine", **REST)
