@@ -215,7 +215,7 @@ def plain_heat_maps(
 ) -> tuple[Float[Array, "image joint 2"], Float[Array, "image joint h w"]]:
     """Return the joints in pixels, and the heat maps whose expectation they are (paper, eq. 3)."""
     w, root = _weights(params)["heat_maps"], config.root
-    x = _top_down(levels, w["branch"], config.backbone.strides.index(root.branch_stride))
+    x = _top_down(levels, w.get("branch", {}), config.backbone.strides.index(root.branch_stride))
     logits = _conv(_max_pool(x, root.pooling, root.pooling), w["to_logits"]).transpose(0, 3, 1, 2)
     heat = jnp.exp(logits) if root.activation is HeatActivation.SOFTMAX else jax.nn.sigmoid(logits)
     heat = heat / jnp.sum(heat, (-2, -1), keepdims=True)
@@ -228,7 +228,7 @@ def plain_features(params: Params, levels: list[Array], config: Config) -> Float
     """Return the maps that the basis points sample, without the position code."""
     w = _weights(params)["features"]
     if config.features.fusion is FeatureFusion.TOP_DOWN:
-        x = _top_down(levels, w["branch"], config.backbone.strides.index(config.features.stride))
+        x = _top_down(levels, w.get("branch", {}), config.backbone.strides.index(config.features.stride))
     else:
         x = levels[0]
         for reduce, coarser in zip(_rows(w["branch"]["reductions"]), levels[1:], strict=True):
@@ -421,17 +421,16 @@ def _layer(
     read = e if decoder.first_attention is AttentionKeys.QUERIES else basis
     e = _layer_norm(e + _attention(e, read, w["self_attention"], decoder.num_heads), norms[0], epsilon)
     e = _layer_norm(e + _attention(e, basis, w["cross_attention"], decoder.num_heads), norms[1], epsilon)
-    vector = w["vector_attention"]
+    vector, near = w["vector_attention"], around[0]
     if decoder.vector_form is VectorForm.BASIS:
-        e = _layer_norm(e + _vector_attention(e, x, features, *around[0], vector), norms[2], epsilon)
+        e = _layer_norm(e + _vector_attention(e, x, features, near, vector), norms[2], epsilon)
     else:
-        scale, near_basis, near_queries = e.shape[-1] ** -0.5, around[0], around[1]
-        among, to_basis = vector["queries"], vector["basis"]
+        scale, among, to_basis = e.shape[-1] ** -0.5, vector["queries"], vector["basis"]
         mapped = _linear(e, among["before"])
-        read = _vector_attention(mapped, x, mapped, *near_queries, among["attention"], scale)
+        read = _vector_attention(mapped, x, mapped, around[1], among["attention"], scale)
         e = e + _linear(read, among["after"])
         mapped = _linear(features, to_basis["before"])
-        read = _vector_attention(e, x, mapped, *near_basis, to_basis["attention"], scale)
+        read = _vector_attention(e, x, mapped, near, to_basis["attention"], scale)
         e = e + _linear(read, to_basis["after"])
     if decoder.coordinate_update is CoordinateUpdate.FEED_FORWARD:
         moves = "feed_forward" in w
@@ -460,12 +459,12 @@ def _vector_attention(
     e: Float[Array, "batch query c"],
     x: Float[Array, "batch query 3"],
     features: Float[Array, "batch point c"],
-    index: Int[Array, "batch query k"],
-    positions: Float[Array, "batch query k 3"],
+    neighbours: tuple[Int[Array, "batch query k"], Float[Array, "batch query k 3"]],
     w: Weights,
     scale: float = 1.0,
 ) -> Float[Array, "batch query c"]:
     """sum_j softmax_j(gamma(alpha(E_i) - beta(F_j) + delta_ij)) * (psi(F_j) + delta_ij) (paper, eq. 11)."""
+    index, positions = neighbours
     near = gather(features, index)
     delta = _two_layers(x[:, :, None] - positions, w["xi_in"], w["xi_out"])
     inside = _linear(e, w["alpha"])[:, :, None] - _linear(near, w["beta"]) + delta

@@ -13,9 +13,9 @@ import pytest
 
 from poem_jax.geometry.neighbours import farthest_points, gather
 from poem_jax.hand.template import default_hand
-from poem_jax.hand.topology import QueryOrder
+from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models import inference, poem
-from poem_jax.models.config import DecoderOutput, FirstNeighbours, HRNetConfig
+from poem_jax.models.config import DecoderOutput, FirstNeighbours
 from poem_jax.models.presets import TINY, V2_MEDIUM_RELEASE, preset
 from poem_jax.models.reconstruction import template_queries
 from poem_jax.models.vector_attention import Neighbours
@@ -42,15 +42,37 @@ def _complete(params: dict, config) -> dict:
     return {**params, "constants": {**params["constants"], **extra}}
 
 
+_GAINS = {"second": 0.1, "expand": 0.1, "fuse": 0.1, "theta_out": 0.2, "offset": 0.1}
+
+
+def _damped(params: dict) -> dict:
+    """Keep all numbers near 1 and every move within centimetres, as training does.
+
+    Random residual branches, exchanges and similarities (cubes of the features) would let numbers grow until
+    no softmax has more than one weight, and rounding errors with them.
+    """
+
+    def damp(path, leaf):
+        *names, kind = (part.key for part in path)
+        if kind == "bias":
+            return np.float32(0.2) * leaf
+        last = "scale" if "norm" in names else "kernel"
+        gain = min((_GAINS.get(name, 1.0) for name in names), default=1.0)
+        return np.float32(gain) * leaf if kind == last else leaf
+
+    return {**params, "trainable": jax.tree_util.tree_map_with_path(damp, params["trainable"])}
+
+
 def _like_release(micro, output=DecoderOutput.OFFSETS):
-    """All choices of the release at the size of `micro`; its branches need three maps, the finest finer."""
+    """All choices of the release at the size of `micro`, with as many basis points as its anchors need."""
     made = V2_MEDIUM_RELEASE
     return replace(
         made,
         image_hw=micro.image_hw,
         width=micro.width,
-        backbone=HRNetConfig(4, stem_channels=4, stem_blocks=2, modules=(1, 1, 1), blocks=1),
-        basis=replace(made.basis, num_points=micro.basis.num_points),
+        backbone=replace(micro.backbone, blocks=(1, 1, 1), channels=(8, 8, 16)),
+        features=replace(made.features, stride=8),
+        basis=replace(made.basis, num_points=NUM_QUERIES),
         decoder=replace(made.decoder, num_layers=2, num_neighbours=4, ffn_expansion=1, output=output),
     )
 
@@ -63,23 +85,19 @@ def _like_tiny(micro):
 
 @pytest.fixture
 def compare(plain_form, make_params, make_scene, monkeypatch):
-    """Return the largest distances (metres) of `apply` and `infer` from the plain form, a sample with known
-    root and one without."""
+    """Return the largest distances (metres) of `apply` and `infer` from the plain form."""
 
     def compare(config, views=VIEWS, seed=0) -> list[float]:
-        params = _complete(make_params(config), config)
+        params = _complete(_damped(make_params(config)), config)
         images, cams = make_scene(1, views, seed, config.image_hw)
         root = np.full((1, 3), 0.01, np.float32)
-        run = jax.jit(functools.partial(plain_form.plain_forward, config=config))
-        expected, found = run(params, images, cams, root=root)
+        expected, found = _plain(plain_form, config)(params, images, cams, root=root)
         assert np.isfinite(expected.layers).all()
         _hand_back(monkeypatch, found)
         apart = []
         for result in (
             poem.apply(params, images, cams, config=config, root_world=root),
-            inference.infer(
-                inference.prepare(params, config), images, cams, config=config, root_world=root
-            ),
+            inference.infer(inference.prepare(params, config), images, cams, root_world=root),
         ):
             np.testing.assert_allclose(result.keypoints_px, expected.keypoints_px, atol=1e-3)
             np.testing.assert_allclose(result.heat_maps, expected.heat_maps, atol=1e-5)
@@ -89,6 +107,14 @@ def compare(plain_form, make_params, make_scene, monkeypatch):
 
     yield compare
     _forget_programs()
+
+
+def _plain(plain_form, config):
+    """The plain form, compiled without optimisation, which is quicker."""
+    return jax.jit(
+        functools.partial(plain_form.plain_forward, config=config),
+        compiler_options={"xla_backend_optimization_level": 0},
+    )
 
 
 def _hand_back(monkeypatch, found) -> None:
@@ -107,7 +133,8 @@ def _hand_back(monkeypatch, found) -> None:
 def _forget_programs() -> None:
     """Programs hold the neighbours that they were traced with."""
     poem._predict.clear_cache()
-    inference._program.cache_clear()
+    inference._find.clear_cache()
+    inference._one_thread.cache_clear()
 
 
 def test_paper(compare, micro_config):
@@ -126,12 +153,9 @@ def test_release(compare, micro_config):
     assert max(compare(_like_release(micro_config))) < 1e-5
 
 
-def test_release_parametric(compare, micro_config):
-    assert max(compare(_like_release(micro_config, DecoderOutput.HAND_PARAMETERS))) < 1e-5
-
-
-def test_one_view(compare, micro_config):
-    assert max(compare(_like_release(micro_config), views=1)) < 1e-5
+def test_release_parametric_of_one_view(compare, micro_config):
+    config = _like_release(micro_config, DecoderOutput.HAND_PARAMETERS)
+    assert max(compare(config, views=1)) < 1e-5
 
 
 def test_tiny(compare, micro_config):
@@ -140,7 +164,7 @@ def test_tiny(compare, micro_config):
 
 def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_scene):
     params, (images, cams) = make_params(micro_config), make_scene(2, VIEWS)
-    run = jax.jit(functools.partial(plain_form.plain_forward, config=micro_config))
+    run = _plain(plain_form, micro_config)
     expected, found = run(params, images, cams)
     again, used = run(params, images, cams, neighbours=found)
     np.testing.assert_array_equal(found, used)
@@ -157,8 +181,3 @@ def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_sce
 def test_full_size(compare, name, largest):
     config = preset(name)
     assert max(compare(config, views=2)) < largest
-
-
-def test_query_order_matters_to_the_scene():
-    """The template of the release-like models is in their own order."""
-    assert V2_MEDIUM_RELEASE.decoder.query_order is QueryOrder.JOINTS_FIRST

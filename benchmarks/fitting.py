@@ -1,0 +1,174 @@
+"""Time and error of the fitting solvers on synthetic takes: `python benchmarks/fitting.py [--quick]`.
+
+Own hand in natural poses, one unknown shape a take, cameras 1280 x 720 with f = 900 px, 0.7-1.2 m away. Both
+solvers see the same key points; neither uses a silhouette. The first call is stated apart; then the contestants
+take turns, and medians are reported. `adam-300` starts at the triangulated wrist with the flat hand, or, marked
+"same start", where `lm` starts.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from poem_jax.fitting.adam import AdamParameters
+from poem_jax.fitting.keypoints import triangulate_robust
+from poem_jax.fitting.kinematics import keypoint_model
+from poem_jax.fitting.lm import LMConfig, ShapeMode
+from poem_jax.fitting.solvers import FitConfig, FitResult, fit_take, fit_take_adam
+from poem_jax.fitting.start import closed_form_pose
+from poem_jax.geometry.cameras import project
+from poem_jax.geometry.transforms import quaternion_from_rotation, rotation_from_axis_angle
+from poem_jax.geometry.triangulation import triangulate
+from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.template import default_hand
+from poem_jax.synthetic.poses import sample_pose
+
+MODEL = keypoint_model(default_hand())
+
+
+class Take(NamedTuple):
+    """Key points of a take, and its truth in metres."""
+
+    uv_px: np.ndarray
+    K: np.ndarray
+    T: np.ndarray
+    shape: np.ndarray
+    joints: np.ndarray
+    vertices: np.ndarray
+
+
+def make_rig(rng: np.random.Generator, views: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return K and T_cam_from_world of cameras around and above the origin."""
+    azimuth = 2 * np.pi * np.arange(views) / views + rng.uniform(-0.2, 0.2, views)
+    height, distance = rng.uniform(0.2, 1.0, views), rng.uniform(0.7, 1.2, views)
+    ground = np.stack([np.cos(azimuth), np.sin(azimuth)], -1) * np.cos(height)[:, None]
+    centres = distance[:, None] * np.concatenate([ground, np.sin(height)[:, None]], -1)
+    forward = -centres / distance[:, None]
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    T = np.tile(np.eye(4), (views, 1, 1))
+    T[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:, :3, 3] = -np.einsum("vij,vj->vi", T[:, :3, :3], centres)
+    K = np.tile(np.array([[900, 0, 640], [0, 900, 360], [0, 0, 1.0]]), (views, 1, 1))
+    return K.astype(np.float32), T.astype(np.float32)
+
+
+def make_take(frames: int, views: int, noise_px: float, outliers: float, seed: int) -> Take:
+    """Draw a take; outliers lie 50 px off in any direction."""
+    rng = np.random.default_rng(seed)
+    pose = sample_pose(rng, frames)
+    pose[:, 0] = Rotation.random(frames, random_state=seed).as_rotvec()
+    shape = np.tile(rng.normal(size=10), (frames, 1))
+    place = rng.uniform(-0.08, 0.08, (frames, 3))
+    pose, shape, place = (x.astype(np.float32) for x in (pose, shape, place))
+    mesh = hand_mesh(default_hand(), pose, shape, place, center_joint=9)
+    K, T = make_rig(rng, views)
+    uv = project(K[None], T[None], mesh.joints[:, None])[0]
+    uv = uv + noise_px * rng.normal(size=uv.shape)
+    angle = rng.uniform(0, 2 * np.pi, uv.shape[:-1])
+    off = (rng.random(uv.shape[:-1]) < outliers)[..., None]
+    uv = uv + 50 * off * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return Take(uv.astype(np.float32), K, T, shape[0], mesh.joints, mesh.vertices)
+
+
+def error_mm(result: FitResult, take: Take, what: str = "joints") -> float:
+    """Return the mean distance from the truth over the valid frames."""
+    distance = np.linalg.norm(getattr(result, what) - getattr(take, what)[: len(result.valid)], axis=-1)
+    return 1000 * float(distance[np.asarray(result.valid)].mean())
+
+
+def same_start(take: Take) -> AdamParameters:
+    """Return `lm`'s closed-form start as Adam's parameters."""
+    points = triangulate_robust(take.uv_px, take.K, take.T, take_axis=0)
+    shape = jnp.zeros((len(take.uv_px), 10))
+    pose, wrist = closed_form_pose(MODEL, points.points, points.valid, shape)
+    return AdamParameters(quaternion_from_rotation(rotation_from_axis_angle(pose)), shape, wrist)
+
+
+def contestants(take: Take) -> dict[str, tuple[Callable[[], FitResult], int]]:
+    """Return name -> (call, frames a call)."""
+    lm, adam = jax.jit(partial(fit_take, MODEL)), jax.jit(partial(fit_take_adam, MODEL))
+    whole = (take.uv_px, take.K, take.T)
+    alone = (take.uv_px[:1], take.K, take.T)
+    begin = jax.jit(lambda uv: same_start(take._replace(uv_px=uv)))(take.uv_px)
+    frames = len(take.uv_px)
+    return {
+        "adam-300 alone": (lambda: adam(*alone), 1),
+        "adam-300 batched": (lambda: adam(*whole), frames),
+        "adam-300 batched, same start": (lambda: adam(*whole, start=begin), frames),
+        "lm alone": (lambda: lm(*alone), 1),
+        "lm batched": (lambda: lm(*whole), frames),
+    }
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Return the wall time of one call."""
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - start
+
+
+def time_table(frames: int, rounds: int) -> None:
+    """Print ms a frame and joint error of every solver on 4 views of 2 px noise."""
+    take = make_take(frames, 4, 2.0, 0.0, seed=1)
+    entries = contestants(take)
+    first = {name: seconds(call) for name, (call, _) in entries.items()}
+    spent: dict[str, list[float]] = {name: [] for name in entries}
+    for _ in range(rounds):
+        for name, (call, count) in entries.items():
+            spent[name].append(1000 * seconds(call) / count)
+    print(f"\n{frames} frames x 4 views, 2 px, medians of {rounds} rounds\n")
+    print("| solver | ms a frame | first call, s | joints, mm |\n|---|---|---|---|")
+    for name, (call, _) in entries.items():
+        error = error_mm(call(), take)
+        print(f"| {name} | {np.median(spent[name]):.2f} | {first[name]:.1f} | {error:.2f} |", flush=True)
+
+
+def error_table(frames: int, seeds: int) -> None:
+    """Print joint and vertex error of `lm` by views, noise, outliers and what is known of the shape."""
+    print(f"\nlm, {seeds} takes of {frames} frames; 1 sigma = share of joint coordinates within sigma_m\n")
+    print("| views | noise, px | outliers | shape | DLT, mm | joints, mm | vertices, mm | 1 sigma |")
+    print("|---|---|---|---|---|---|---|---|")
+    for views, noise in ((8, 1.0), (4, 2.0), (2, 2.0)):
+        for mode in (ShapeMode.SHARED, ShapeMode.GIVEN):
+            fit = jax.jit(partial(fit_take, MODEL, config=FitConfig(lm=LMConfig(shape_mode=mode))))
+            for outliers in (0.0, 0.1):
+                takes = [make_take(frames, views, noise, outliers, seed) for seed in range(seeds)]
+                row = np.mean([error_row(fit, take, mode) for take in takes], axis=0)
+                print(
+                    f"| {views} | {noise:g} | {outliers:.0%} | {mode} | {row[0]:.2f} | {row[1]:.2f} |", end=""
+                )
+                print(f" {row[2]:.2f} | {row[3]:.2f} |", flush=True)
+
+
+def error_row(
+    fit: Callable[..., FitResult], take: Take, mode: ShapeMode
+) -> tuple[float, float, float, float]:
+    """Return errors of DLT, joints and vertices in mm, and the share within one sigma."""
+    result = fit(take.uv_px, take.K, take.T, shape=take.shape if mode is ShapeMode.GIVEN else None)
+    frames = len(take.uv_px)
+    K, T = (np.broadcast_to(x, (frames, *x.shape)) for x in (take.K, take.T))
+    dlt = 1000 * np.linalg.norm(triangulate(take.uv_px, K, T)[0] - take.joints, axis=-1).mean()
+    inside = np.abs(result.joints - take.joints) < np.asarray(result.sigma_m)[..., None]
+    share = inside[np.asarray(result.valid)].mean()
+    return float(dlt), error_mm(result, take), error_mm(result, take, "vertices"), float(share)
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer frames, rounds and takes")
+    quick = parser.parse_args().quick
+    time_table(frames=100 if quick else 500, rounds=3 if quick else 7)
+    error_table(frames=50, seeds=2 if quick else 8)
+
+
+if __name__ == "__main__":
+    main()
