@@ -158,14 +158,25 @@ def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]
     @jax.checkpoint  # pyright: ignore[reportPrivateImportUsage]
     def add(sums: _Sums, neighbour: Neighbours) -> _Sums:
         logits, values = visit(neighbour)
-        largest = jnp.maximum(sums.largest, jax.lax.stop_gradient(logits))
-        kept, weight = jnp.exp(sums.largest - largest), jnp.exp(logits - largest)
-        return _Sums(largest, kept * sums.denominator + weight, kept * sums.numerator + weight * values)
+        rise = jax.lax.stop_gradient(logits) - sums.largest
+        # Either the old sums or the new weight is scaled by one, so one exponential serves both.
+        smaller = jnp.exp(-jnp.abs(rise))
+        kept, weight = jnp.where(rise > 0, smaller, 1), jnp.where(rise > 0, 1, smaller)
+        weight = _with_derivative(weight, logits)
+        return _Sums(
+            jnp.maximum(sums.largest, jax.lax.stop_gradient(logits)),
+            kept * sums.denominator + weight,
+            kept * sums.numerator + weight * values,
+        )
 
     logits, values = visit(jax.tree.map(lambda leaf: leaf[0], neighbours))
-    largest = jax.lax.stop_gradient(logits)
-    weight = jnp.exp(logits - largest)  # one, but not to its derivative
-    first = _Sums(largest, weight, weight * values)
+    weight = _with_derivative(jnp.ones_like(logits), logits)
+    first = _Sums(jax.lax.stop_gradient(logits), weight, weight * values)
     rest = jax.tree.map(lambda leaf: leaf[1:], neighbours)
     sums, _ = jax.lax.scan(lambda sums, neighbour: (add(sums, neighbour), None), first, rest)
     return sums.numerator / sums.denominator
+
+
+def _with_derivative(weight: Array, logits: Array) -> Array:
+    """Return `weight`, a constant number, as the exponential of `logits` that it is."""
+    return weight * (1 + (logits - jax.lax.stop_gradient(logits)))
