@@ -1,9 +1,9 @@
 """Time and error of the fitting solvers on synthetic takes: `python benchmarks/fitting.py [--quick]`.
 
 Own hand in natural poses, one unknown shape a take, cameras 1280 x 720 with f = 900 px, 0.7-1.2 m away. Both
-solvers see the same key points; neither uses a silhouette. The first call is stated apart; then the contestants
-take turns, and medians are reported. `adam-300` starts at the triangulated wrist with the flat hand, or, marked
-"same start", where `lm` starts.
+solvers see the same key points; neither uses a silhouette. The first call is stated apart; then the
+contestants take turns, and medians are reported. `adam-300` starts at the triangulated wrist with the flat
+hand, or, marked "same start", where `lm` starts.
 """
 
 import argparse

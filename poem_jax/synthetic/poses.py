@@ -1,25 +1,19 @@
-"""Natural hand poses: anatomical angles, their limits, and a sampler of families of poses.
+"""A sampler of natural hand poses: families of poses within the limits of `hand/joint_limits.py`.
 
-An angle vector has shape (..., 15, 3): the joints of MANO's skeleton without the wrist, in MANO's order,
-and per joint flexion (positive = towards the palm), abduction (positive = towards the thumb's side; for the
-thumb out of the palm's plane) and twist (about the bone), radians. They are the components of the joint's
-axis-angle vector along its anatomical axes, so that `angles_to_pose` is linear and has an exact inverse.
-
-Limits follow the active ranges of adult hands (American Academy of Orthopaedic Surgeons, Joint Motion,
-1965; Hume et al., J. Hand Surg. 15A, 1990), rounded; joints that only hinge keep a few degrees of play off
-their axis.
+Angle vectors (..., 15, 3) are explained there: flexion, abduction and twist per bending joint, radians. Here
+they are turned into poses of the shipped right hand: `angles_to_pose` is linear and has an exact inverse.
 """
 
 from functools import cache
 
 import numpy as np
 
-from poem_jax.hand.topology import MANO_FINGER_NAMES, NUM_SKELETON_JOINTS
+from poem_jax.hand.joint_limits import ANGLE_NAMES as ANGLE_NAMES
+from poem_jax.hand.joint_limits import LIMITS_DEG, NUM_BENDING_JOINTS, POSE_LIMITS, axes_of_fingers
+from poem_jax.hand.topology import MANO_FINGER_NAMES
 from poem_jax.synthetic.clearance import clearance, posed_fingers, rest_fingers
 from poem_jax.typing import Array, Float
 
-NUM_BENDING_JOINTS = NUM_SKELETON_JOINTS - 1
-ANGLE_NAMES = ("flexion", "abduction", "twist")
 FAMILIES = ("fist", "pinch", "counting", "flat", "grasp", "random", "point")
 """Named kinds of poses:
 
@@ -34,19 +28,6 @@ FAMILIES = ("fist", "pinch", "counting", "flat", "grasp", "random", "point")
 FAMILY_SHARES = (0.17, 0.15, 0.17, 0.15, 0.18, 0.18, 0.0)
 """Of FAMILIES in the mixture. The benchmark draws from it, so it is frozen: "point" came later and is drawn
 by name only (about 2 % of "counting" point too)."""
-
-_HINGE = ((-3, 3), (-3, 3))
-_LIMITS_DEG = {
-    "index": (((-20, 85), (-14, 16), (-5, 5)), ((0, 100), *_HINGE), ((0, 65), *_HINGE)),
-    "middle": (((-20, 85), (-12, 12), (-5, 5)), ((0, 100), *_HINGE), ((0, 65), *_HINGE)),
-    "ring": (((-20, 85), (-14, 12), (-5, 5)), ((0, 100), *_HINGE), ((0, 65), *_HINGE)),
-    "little": (((-20, 85), (-18, 14), (-5, 5)), ((0, 100), *_HINGE), ((0, 65), *_HINGE)),
-    "thumb": (((-15, 30), (-8, 30), (-10, 25)), ((-10, 50), (-6, 6), (-5, 5)), ((-15, 70), *_HINGE)),
-}
-POSE_LIMITS: Float[np.ndarray, "15 3 2"] = np.deg2rad(
-    np.array([_LIMITS_DEG[name] for name in MANO_FINGER_NAMES], dtype=float).reshape(-1, 3, 2)
-)
-"""(lowest, highest) of every angle, radians; joints in MANO's order, columns as ANGLE_NAMES."""
 
 _LONG_FINGERS = ("index", "middle", "ring", "little")
 _FINGER_STATES = {
@@ -72,9 +53,6 @@ _FAMILY_STATES = {
     "random": ((_ANY,), (_ANY,)),
     "point": (("curled",), ("out", "opposed")),
 }
-_UP = np.array([0.0, 1.0, 0.0])
-_THUMB_NAIL = np.array([0.35, 0.70, 0.62])
-"""Where the nails point at rest."""
 _CANDIDATES = 6
 _ROUNDS = 12
 _COLLISION_PENALTY = 1.0
@@ -133,18 +111,8 @@ def pose_to_angles(pose: Float[Array, "*batch 16 3"]) -> Float[Array, "*batch 15
 
 @cache
 def joint_axes() -> Float[np.ndarray, "15 3 3"]:
-    """Unit axes (rows flexion, abduction, twist) of each joint of a right hand at rest, orthonormal.
-
-    Twist runs along the bone and abduction about the direction of the nail; in the thumb that one is turned
-    out of the palm's plane.
-    """
-    points = rest_fingers()
-    bones = (points[:, 1:] - points[:, :-1]).reshape(-1, 3)
-    twist = bones / np.linalg.norm(bones, axis=-1, keepdims=True)
-    nail = np.repeat(np.where(np.array(MANO_FINGER_NAMES)[:, None] == "thumb", _THUMB_NAIL, _UP), 3, axis=0)
-    abduction = nail - twist * (nail * twist).sum(-1, keepdims=True)
-    abduction /= np.linalg.norm(abduction, axis=-1, keepdims=True)
-    return np.stack([np.cross(abduction, twist), abduction, twist], axis=-2)
+    """Unit axes (rows flexion, abduction, twist) of each joint of a right hand at rest, orthonormal."""
+    return axes_of_fingers(rest_fingers())
 
 
 def _best_candidate(rng: np.random.Generator, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,7 +172,7 @@ def _draw(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
 def _state_tables() -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Boxes (state, 3, 3, 2) of each finger in radians, and per family the states to choose from."""
     boxes = {name: _finger_boxes(name) for name in _LONG_FINGERS}
-    thumb = [np.array(box, dtype=float) for box in (*_THUMB_STATES.values(), _LIMITS_DEG["thumb"])]
+    thumb = [np.array(box, dtype=float) for box in (*_THUMB_STATES.values(), LIMITS_DEG["thumb"])]
     boxes["thumb"] = np.deg2rad(np.stack(thumb))
     finger_names, thumb_names = [*_FINGER_STATES, _ANY], [*_THUMB_STATES, _ANY]
     chosen = [_FAMILY_STATES[family] for family in FAMILIES]
@@ -216,7 +184,7 @@ def _state_tables() -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
 
 
 def _finger_boxes(name: str) -> np.ndarray:
-    limits = np.array(_LIMITS_DEG[name], dtype=float)
+    limits = np.array(LIMITS_DEG[name], dtype=float)
     boxes = np.repeat(limits[None], len(_FINGER_STATES) + 1, axis=0)
     for k, flexions in enumerate(_FINGER_STATES.values()):
         boxes[k, :, 0] = flexions

@@ -1,0 +1,1 @@
+"""Hands fitted to 2D key points in calibrated views: robust triangulation, residuals, solvers."""

@@ -1,0 +1,207 @@
+"""Iterative fitting with Adam, as the paper states it and as its code released it.
+
+The paper's recipe: 300 steps of Adam, step size 1e-2, halved when the loss has not improved for 50 steps. The
+released recipe differs: the shape has a step size of its own (1e-3); the gradient is clipped to norm 0.1 over
+all parameters; and it is never zeroed, so that every step adds the new gradient to the clipped previous one.
+Both minimise 1000 * key points + 50 * anatomy over 16 quaternions, shape and translation (the silhouette term
+is a part of neither here).
+
+Written out instead of taken from optax: the accumulated gradient and the rule of the plateau, which must
+follow PyTorch's `ReduceLROnPlateau` step by step, are the recipe.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from poem_jax.fitting.anatomy import anatomy_loss, anatomy_terms, rotations_from_raw_quaternions
+from poem_jax.fitting.keypoints import projection_jacobian
+from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints_of_rotations
+from poem_jax.typing import Array, Float
+
+KEYPOINT_WEIGHT = 1000.0
+ANATOMY_WEIGHT = 50.0
+RELEASE_DIAGONAL_PX = 362.03867196751236
+"""Diagonal of the release's 256 x 256 images."""
+
+_BETAS = (0.9, 0.999)
+_EPSILON = 1e-8
+
+
+@dataclass(frozen=True)
+class AdamRecipe:
+    """How to descend; static under `jax.jit`."""
+
+    steps: int = 300
+    rate: float = 1e-2
+    """Step size of pose and translation."""
+    shape_rate: float = 1e-2
+    patience: int = 50
+    """Steps without improvement before the rates are halved."""
+    threshold: float = 1e-4
+    """Relative; less than this is no improvement."""
+    least_rate: float = 1e-5
+    clip_norm: float | None = None
+    """Bound of the gradient's norm over all parameters together."""
+    accumulate: bool = False
+    """Add each new gradient to the clipped previous one."""
+
+
+ADAM_300 = AdamRecipe()
+"""The paper's."""
+ADAM_300_RELEASE = AdamRecipe(shape_rate=1e-3, clip_norm=0.1, accumulate=True)
+"""The released code's."""
+
+
+class AdamParameters(NamedTuple):
+    """What Adam moves, for one frame."""
+
+    quaternions: Float[Array, "16 4"]
+    """wxyz, MANO order, of any length."""
+    shape: Float[Array, "10"]
+    translation: Float[Array, "3"]
+    """Place of the wrist, metres, world frame."""
+
+
+class AdamTrace(NamedTuple):
+    """What happened at every step: values before it."""
+
+    keypoint_loss: Float[Array, "step"]
+    """Key-point term, without its weight."""
+    loss: Float[Array, "step"]
+    rates: Float[Array, "step 3"]
+    """Step sizes of quaternions, shape and translation."""
+    parameters: AdamParameters
+    """After the step, with a leading axis of steps."""
+
+
+class _State(NamedTuple):
+    parameters: AdamParameters
+    mean: AdamParameters
+    square: AdamParameters
+    gradient: AdamParameters
+    rates: Float[Array, "3"]
+    best: Float[Array, ""]
+    waited: Array
+
+
+def released_start(
+    noise: Float[Array, "16 4"] | None = None, translation: Float[Array, "3"] | None = None
+) -> AdamParameters:
+    """Return the release's start: identity quaternions plus 0.1 * `noise`, mean shape, 0.6 m ahead.
+
+    Args:
+        noise: uniform in [0, 1) in the release; None adds none.
+        translation: place of the wrist, metres; None puts it at (0, 0, 0.6) of the world.
+    """
+    identity = jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (16, 1))
+    place = jnp.asarray([0, 0, 0.6]) if translation is None else translation
+    return AdamParameters(identity if noise is None else identity + 0.1 * noise, jnp.zeros(10), place)
+
+
+def fitting_loss(
+    parameters: AdamParameters,
+    model: KeypointModel,
+    uv_px: Float[Array, "view 21 2"],
+    weights: Float[Array, "view 21"],
+    K: Float[Array, "view 3 3"],
+    T_cam_from_world: Float[Array, "view 4 4"],
+    diagonal_px: float | Array = RELEASE_DIAGONAL_PX,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return 1000 * key points + 50 * anatomy of one frame, and the key-point term alone.
+
+    Key points: mean over views and joints of confidence * |projected - observed|^2 / diagonal^2; pixels with
+    weight zero must be finite.
+    """
+    rotations = rotations_from_raw_quaternions(parameters.quaternions)
+    posed = pose_keypoints_of_rotations(model, rotations, parameters.shape)
+    pixels, _ = projection_jacobian(K, T_cam_from_world, posed.points + parameters.translation)
+    square = jnp.sum((pixels - uv_px) ** 2, axis=-1)
+    keypoints = jnp.mean(weights * square) / diagonal_px**2
+    anatomy = anatomy_loss(
+        anatomy_terms(parameters.quaternions, parameters.shape, posed.rotations, posed.points)
+    )
+    return KEYPOINT_WEIGHT * keypoints + ANATOMY_WEIGHT * anatomy, keypoints
+
+
+def adam_fit(
+    model: KeypointModel,
+    uv_px: Float[Array, "view 21 2"],
+    weights: Float[Array, "view 21"],
+    K: Float[Array, "view 3 3"],
+    T_cam_from_world: Float[Array, "view 4 4"],
+    start: AdamParameters,
+    recipe: AdamRecipe = ADAM_300,
+    *,
+    diagonal_px: float | Array = RELEASE_DIAGONAL_PX,
+    trace: bool = False,
+) -> tuple[AdamParameters, AdamTrace | None]:
+    """Fit one frame; map it over frames with `jax.vmap`.
+
+    Args:
+        uv_px, weights: key points and confidences; weight zero means "ignore", the pixels must be finite.
+        start: where to begin, see `released_start`.
+        recipe: static.
+        diagonal_px: the unit of the key-point term, the images' diagonal.
+        trace: return what happened at every step as well.
+    """
+
+    def loss(parameters: AdamParameters) -> tuple[Array, Array]:
+        return fitting_loss(parameters, model, uv_px, weights, K, T_cam_from_world, diagonal_px)
+
+    def step(state: _State, _: None) -> tuple[_State, AdamTrace | None]:
+        (value, keypoints), gradient = jax.value_and_grad(loss, has_aux=True)(state.parameters)
+        after = _adam_step(state, gradient, value, count=state.waited[1] + 1, recipe=recipe)
+        return after, AdamTrace(keypoints, value, state.rates, after.parameters) if trace else None
+
+    state, history = jax.lax.scan(step, _first_state(start, recipe), None, length=recipe.steps)
+    return state.parameters, history
+
+
+def _first_state(start: AdamParameters, recipe: AdamRecipe) -> _State:
+    zero = jax.tree.map(jnp.zeros_like, start)
+    dtype = start.translation.dtype
+    rates = jnp.asarray([recipe.rate, recipe.shape_rate, recipe.rate], dtype)
+    return _State(start, zero, zero, zero, rates, jnp.asarray(jnp.inf, dtype), jnp.zeros(2, jnp.int32))
+
+
+def _adam_step(
+    state: _State, gradient: AdamParameters, value: Array, *, count: Array, recipe: AdamRecipe
+) -> _State:
+    """Return the state after one step; `waited` holds the plateau's counter and the number of steps."""
+    if recipe.accumulate:
+        gradient = jax.tree.map(jnp.add, state.gradient, gradient)
+    if recipe.clip_norm is not None:
+        gradient = _clipped(gradient, recipe.clip_norm)
+    first, second = _BETAS
+    mean = jax.tree.map(lambda m, g: first * m + (1 - first) * g, state.mean, gradient)
+    square = jax.tree.map(lambda s, g: second * s + (1 - second) * g * g, state.square, gradient)
+    steps = count.astype(value.dtype)
+    mean_bias, square_bias = 1 - first**steps, 1 - second**steps
+
+    def moved(p: Array, m: Array, s: Array, rate: Array) -> Array:
+        return p - rate / mean_bias * m / (jnp.sqrt(s) / jnp.sqrt(square_bias) + _EPSILON)
+
+    rates = AdamParameters(*state.rates)
+    parameters = jax.tree.map(moved, state.parameters, mean, square, rates)
+    new_rates, best, waited = _plateau(state, value, recipe)
+    return _State(parameters, mean, square, gradient, new_rates, best, jnp.stack([waited, count]))
+
+
+def _clipped(gradient: AdamParameters, bound: float) -> AdamParameters:
+    """Scale the gradient to a norm of at most `bound`, as `torch.nn.utils.clip_grad_norm_`."""
+    norm = jnp.sqrt(sum(jnp.sum(g * g) for g in gradient))
+    factor = jnp.minimum(bound / (norm + 1e-6), 1)
+    return jax.tree.map(lambda g: g * factor, gradient)
+
+
+def _plateau(state: _State, value: Array, recipe: AdamRecipe) -> tuple[Array, Array, Array]:
+    """Halve the rates after more than `patience` steps without improvement; return rates, best, counter."""
+    better = value < state.best * (1 - recipe.threshold)
+    best = jnp.where(better, value, state.best)
+    waited = jnp.where(better, 0, state.waited[0] + 1)
+    halve = waited > recipe.patience
+    rates = jnp.where(halve, jnp.maximum(0.5 * state.rates, recipe.least_rate), state.rates)
+    return rates, best, jnp.where(halve, 0, waited)

@@ -1,0 +1,217 @@
+"""Fit a hand to the 2D key points of calibrated views: one call per take and hand.
+
+`fit_take` triangulates robustly, poses the hand in closed form, and refines pose, place and shape by
+Levenberg-Marquardt (`lm`). `fit_take_adam` runs the paper's iterative optimisation on the same input. Both
+are pure, work under `jax.jit` (config static) and `jax.vmap` (over hands or takes; models of several hands
+are stacked leaf by leaf), and never let one bad frame stop a take.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
+from poem_jax.fitting.anatomy import axis_angle_from_raw_quaternion
+from poem_jax.fitting.keypoints import RobustPoints, projection_jacobian, triangulate_robust
+from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
+from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState, joint_sigma, solve
+from poem_jax.fitting.smooth import SmoothConfig, smooth
+from poem_jax.fitting.start import FEWEST_JOINTS, closed_form_pose
+from poem_jax.hand.model import HandModel, hand_mesh
+from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, WRIST
+from poem_jax.typing import Array, Bool, Float
+
+__all__ = ["FitConfig", "FitResult", "HandModel", "fit_take", "fit_take_adam", "keypoint_model"]
+
+_LEAST_SIGMA_PX = 0.3
+"""Key points count as at least this noisy: float32 and the hand model are no better."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Static settings of `fit_take`."""
+
+    lm: LMConfig = field(default_factory=LMConfig)
+    gate_px: float = 20.0
+    """A view further off than this from where the others see a joint is an outlier, pixels."""
+    smooth: SmoothConfig | None = None
+    """A second pass over the whole take; None leaves it out."""
+
+
+class FitResult(NamedTuple):
+    """A hand over a take. World frame, metres; where not `valid`, finite numbers that mean nothing."""
+
+    pose: Float[Array, "frame 16 3"]
+    """Axis-angle, MANO order; row 0 turns the hand about its wrist joint into the world."""
+    shape: Float[Array, "frame 10"]
+    """The same in every frame unless fitted per frame."""
+    translation: Float[Array, "frame 3"]
+    """As `hand_mesh` takes it."""
+    joints: Float[Array, "frame 21 3"]
+    vertices: Float[Array, "frame 778 3"]
+    valid: Bool[Array, "frame"]
+    """True where at least two views gave three or more joints."""
+    reprojection_px: Float[Array, "frame view"]
+    """Mean distance of the fitted joints from the finite, unmasked key points, outliers included; NaN where
+    a view has none."""
+    sigma_m: Float[Array, "frame 21"]
+    """Standard deviation of one coordinate of each joint; zero where not `valid`."""
+
+
+def fit_take(
+    model: KeypointModel,
+    keypoints_px: Float[Array, "..."],
+    K: Float[Array, "..."],
+    T_cam_from_world: Float[Array, "..."],
+    confidence: Float[Array, "..."] | None = None,
+    mask: Bool[Array, "..."] | None = None,
+    shape: Float[Array, "..."] | None = None,
+    config: FitConfig = FitConfig(),
+) -> FitResult:
+    """Fit one hand to all frames of a take.
+
+    Args:
+        model: `keypoint_model(hand)` of the hand's own side.
+        keypoints_px: (frame, view, 21, 2) OpenPose order; NaN = unseen.
+        K: (view, 3, 3) or (frame, view, 3, 3) of these (undistorted) pixels.
+        T_cam_from_world: (view, 4, 4) or (frame, view, 4, 4), metres.
+        confidence: (frame, view, 21) inverse variance, relative; NaN or zero = unseen; None means 1.
+        mask: (frame, view, 21); False means "ignore".
+        shape: the known shape (10,) or (frame, 10); needed by, and only used in, `ShapeMode.GIVEN`.
+        config: static under `jax.jit`.
+
+    Raises:
+        ValueError: fewer than two views; key points, cameras and shape that do not belong together.
+    """
+    _check(keypoints_px, K, T_cam_from_world, shape, config)
+    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config)
+    start = _start(model, points, take, shape)
+    state = solve(model, take, start, config.lm)
+    if config.smooth is not None:
+        state = smooth(model, take, state, config.lm, config.smooth)
+    sigma = joint_sigma(model, take, state, config.lm)
+    return _result(model, keypoints_px, confidence, mask, take, state, sigma)
+
+
+def fit_take_adam(
+    model: KeypointModel,
+    keypoints_px: Float[Array, "frame view 21 2"],
+    K: Float[Array, "*#frame view 3 3"],
+    T_cam_from_world: Float[Array, "*#frame view 4 4"],
+    confidence: Float[Array, "frame view 21"] | None = None,
+    mask: Bool[Array, "frame view 21"] | None = None,
+    start: AdamParameters | None = None,
+    recipe: AdamRecipe = ADAM_300,
+    *,
+    diagonal_px: float = 1468.6,
+) -> FitResult:
+    """Fit one hand by the paper's iterative optimisation, every frame by itself; arguments as `fit_take`.
+
+    Args:
+        start: parameters with a leading axis of frames; None begins with the flat hand, unturned, at the
+            triangulated wrist.
+        recipe: static.
+        diagonal_px: diagonal of the images; the default is that of 1280 x 720.
+
+    Returns: as `fit_take`, with `sigma_m` zero: this solver has no uncertainty.
+    """
+    config = FitConfig()
+    _check(keypoints_px, K, T_cam_from_world, None, config)
+    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config)
+    usable = take.weights > 0
+    weights = usable.astype(take.weights.dtype) if confidence is None else jnp.where(usable, confidence, 0)
+    if start is None:
+        start = jax.vmap(lambda wrist: released_start(None, wrist))(points.points[:, WRIST])
+
+    def one(uv: Array, w: Array, K: Array, T: Array, begin: AdamParameters) -> AdamParameters:
+        return adam_fit(model, uv, w, K, T, begin, recipe, diagonal_px=diagonal_px)[0]
+
+    found = jax.vmap(one)(take.uv_px, weights, take.K, take.T_cam_from_world, start)
+    pose = axis_angle_from_raw_quaternion(found.quaternions)
+    state = TakeState(pose, found.translation, found.shape)
+    return _result(
+        model, keypoints_px, confidence, mask, take, state, jnp.zeros((*pose.shape[:1], NUM_JOINTS))
+    )
+
+
+def _check(uv: Array, K: Array, T: Array, shape: Array | None, config: FitConfig) -> None:
+    if uv.ndim != 4 or uv.shape[-2:] != (NUM_JOINTS, 2):
+        raise ValueError(f"`keypoints_px` must have shape (frame, view, 21, 2); got {uv.shape}")
+    if uv.shape[1] < 2:
+        raise ValueError(f"a fit needs at least two views; got `keypoints_px` of shape {uv.shape}")
+    if K.shape[-3] != uv.shape[1] or T.shape[-3] != uv.shape[1]:
+        raise ValueError(
+            f"key points and cameras must have the same views; got {uv.shape[1]} views of key points, "
+            f"K of shape {K.shape}, T_cam_from_world of shape {T.shape}"
+        )
+    given = config.lm.shape_mode is ShapeMode.GIVEN
+    if given != (shape is not None):
+        raise ValueError(
+            f"`shape` goes with ShapeMode.GIVEN only; got {config.lm.shape_mode!r} and shape {shape}"
+        )
+
+
+def _observe(
+    uv: Array, K: Array, T: Array, confidence: Array | None, mask: Array | None, config: FitConfig
+) -> tuple[TakeObservations, RobustPoints]:
+    """Triangulate, and keep the key points that agree with it as observations."""
+    frames = uv.shape[0]
+    K, T = (jnp.broadcast_to(x, (frames, *x.shape[-3:])) for x in (jnp.asarray(K), jnp.asarray(T)))
+    known = jnp.all(jnp.isfinite(K), (-2, -1)) & jnp.all(jnp.isfinite(T), (-2, -1))
+    K = jnp.where(known[..., None, None], K, jnp.eye(3, dtype=K.dtype))
+    T = jnp.where(known[..., None, None], T, jnp.eye(4, dtype=T.dtype))
+    seen = jnp.broadcast_to(known[..., None], uv.shape[:-1])
+    seen = seen if mask is None else seen & mask
+    points = triangulate_robust(uv, K, T, confidence, seen, gate_px=config.gate_px, take_axis=0)
+    relative = 1.0 if confidence is None else jnp.nan_to_num(jnp.asarray(confidence))
+    sigma = jnp.maximum(points.sigma_px, _LEAST_SIGMA_PX)
+    weights = jnp.where(points.inlier_mask, relative / sigma[:, None, None] ** 2, 0).astype(uv.dtype)
+    enough = jnp.sum(points.valid, -1) >= FEWEST_JOINTS
+    clean = jnp.where(points.inlier_mask[..., None], uv, 0)
+    return TakeObservations(clean, weights, K, T, enough), points
+
+
+def _start(
+    model: KeypointModel, points: RobustPoints, take: TakeObservations, shape: Array | None
+) -> TakeState:
+    frames = take.frame_mask.shape[0]
+    dtype = points.points.dtype
+    known = jnp.zeros(NUM_SHAPES, dtype) if shape is None else jnp.asarray(shape, dtype)
+    known = jnp.broadcast_to(known, (frames, NUM_SHAPES))
+    pose, wrist = closed_form_pose(model, points.points, points.valid, known)
+    keep = take.frame_mask[:, None]
+    return TakeState(jnp.where(keep[..., None], pose, 0), jnp.where(keep, wrist, 0), known)
+
+
+def _result(
+    model: KeypointModel,
+    keypoints_px: Array,
+    confidence: Array | None,
+    mask: Array | None,
+    take: TakeObservations,
+    state: TakeState,
+    sigma: Array,
+) -> FitResult:
+    translation = state.wrist - rest_wrist(model, state.shape)
+    mesh = hand_mesh(model.hand, state.pose, state.shape, translation)
+    pixels, _ = projection_jacobian(take.K, take.T_cam_from_world, mesh.joints)
+    counted = jnp.all(jnp.isfinite(keypoints_px), axis=-1)
+    counted = counted if mask is None else counted & mask
+    counted = counted if confidence is None else counted & (confidence > 0)
+    distance = jnp.linalg.norm(pixels - jnp.where(counted[..., None], keypoints_px, pixels + 1), axis=-1)
+    count = jnp.sum(counted, axis=-1)
+    mean = jnp.sum(jnp.where(counted, distance, 0), axis=-1) / jnp.maximum(count, 1)
+    finite = jnp.all(jnp.isfinite(mesh.joints), axis=(-2, -1))
+    valid = take.frame_mask & finite
+    return FitResult(
+        state.pose,
+        state.shape,
+        translation,
+        mesh.joints,
+        mesh.vertices,
+        valid,
+        jnp.where((count > 0) & valid[:, None], mean, jnp.nan),
+        jnp.where(valid[:, None], sigma, 0),
+    )

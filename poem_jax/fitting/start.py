@@ -1,0 +1,87 @@
+"""A closed-form pose from triangulated joints: where a solver begins, so that it needs no random restarts.
+
+The palm turns with the best rigid fit of wrist and knuckles (Procrustes); every finger bone turns by the
+smallest rotation that brings it from its parent's turn to its observed direction. Joints that nobody saw
+stand where the fitted palm would carry them.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints
+from poem_jax.fitting.residuals import anatomical_angles
+from poem_jax.geometry.alignment import apply_similarity, procrustes
+from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, skew_matrix, transpose
+from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE, WRIST
+from poem_jax.typing import Array, Bool, Float
+
+FEWEST_JOINTS = 3
+"""Joints that a frame must have triangulated to be fitted."""
+
+_SKELETON = np.array(SKELETON_FROM_OPENPOSE)
+_CHAINS = np.arange(1, NUM_SKELETON_JOINTS).reshape(5, 3)
+_PALM = np.isin(np.arange(NUM_JOINTS), [WRIST, 5, 9, 13, 17])
+_MIN_COSINE_SUM = 1e-2
+
+
+def closed_form_pose(
+    model: KeypointModel,
+    joints_world: Float[Array, "*batch 21 3"],
+    valid: Bool[Array, "*batch 21"],
+    shape: Float[Array, "*batch 10"],
+) -> tuple[Float[Array, "*batch 16 3"], Float[Array, "*batch 3"]]:
+    """Return axis-angle pose and wrist place (metres, world) that bring a hand's bones to observed joints.
+
+    Args:
+        joints_world: triangulated joints, metres; anything finite where not `valid`.
+        valid: joints to go by. Frames with fewer than three of them get a finite pose that means nothing.
+        shape: proportions of the hand at rest.
+
+    Returns: the pose, its angles inside the limits of the joints; and the place of the wrist.
+    """
+    rest = pose_keypoints(
+        model, jnp.zeros((*shape.shape[:-1], NUM_SKELETON_JOINTS, 3), shape.dtype), shape
+    ).points
+    palm = valid & _PALM
+    used = jnp.where(jnp.sum(palm, -1, keepdims=True) >= FEWEST_JOINTS, palm, valid)
+    fit = procrustes(rest, joints_world, with_scale=False, mask=used)
+    joints = jnp.where(valid[..., None], joints_world, apply_similarity(fit, rest))
+    pose = axis_angle_from_rotation(_local_turns(fit.R, rest, joints))
+    return _within_limits(model, pose), joints[..., WRIST, :]
+
+
+def _local_turns(
+    palm: Float[Array, "*batch 3 3"], rest: Float[Array, "*batch 21 3"], joints: Float[Array, "*batch 21 3"]
+) -> Float[Array, "*batch 16 3 3"]:
+    """Return every joint's rotation relative to its parent, MANO order."""
+    turn = jnp.broadcast_to(palm[..., None, :, :], (*palm.shape[:-2], len(_CHAINS), 3, 3))
+    locals_ = []
+    for depth in range(_CHAINS.shape[1]):
+        start = _SKELETON[_CHAINS[:, depth]]
+        expected = rest[..., start + 1, :] - rest[..., start, :]
+        observed = joints[..., start + 1, :] - joints[..., start, :]
+        local = smallest_rotation(expected, matmul(transpose(turn), observed[..., None])[..., 0])
+        turn = matmul(turn, local)
+        locals_.append(local)
+    fingers = jnp.stack(locals_, -3).reshape(*palm.shape[:-2], -1, 3, 3)
+    return jnp.concatenate([palm[..., None, :, :], fingers], -3)
+
+
+def smallest_rotation(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
+    """Return the rotation about a x b that turns a towards b (Rodrigues); not one where b is about -a."""
+    a, b = _unit(a), _unit(b)
+    cross = skew_matrix(jnp.cross(a, b))
+    cosine = jnp.sum(a * b, -1)[..., None, None]
+    return jnp.eye(3, dtype=a.dtype) + cross + matmul(cross, cross) / jnp.maximum(1 + cosine, _MIN_COSINE_SUM)
+
+
+def _within_limits(model: KeypointModel, pose: Float[Array, "*batch 16 3"]) -> Float[Array, "*batch 16 3"]:
+    angles = anatomical_angles(pose, model.axes)
+    angles = jnp.clip(angles, model.limits[..., 0], model.limits[..., 1])
+    fingers = jnp.sum(angles[..., None] * model.axes, axis=-2)
+    return jnp.concatenate([pose[..., :1, :], fingers], axis=-2)
+
+
+def _unit(v: Array) -> Array:
+    n2 = jnp.sum(v * v, -1, keepdims=True)
+    return v / jnp.sqrt(jnp.maximum(n2, 1e-12))

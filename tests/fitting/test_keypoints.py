@@ -1,0 +1,112 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from poem_jax.fitting.keypoints import projection_jacobian, triangulate_robust
+from poem_jax.geometry.cameras import project
+
+robust = jax.jit(triangulate_robust, static_argnames="take_axis")
+
+
+def error_mm(points, take):
+    return 1000 * np.linalg.norm(np.asarray(points) - take.joints, axis=-1)
+
+
+@pytest.mark.parametrize("views", [2, 4])
+def test_clean_points_are_exact(takes, views):
+    take = takes(3, views, 0.0, 1)
+    found = robust(take.uv_px, take.K, take.T, take_axis=0)
+    assert bool(found.valid.all())
+    assert bool(found.inlier_mask.all())
+    assert error_mm(found.points, take).max() < 0.01
+
+
+def test_an_outlier_is_found_and_ignored(takes):
+    take = takes(3, 4, 0.5, 2)
+    uv = take.uv_px.copy()
+    uv[:, 1, ::2] += 50
+    found = robust(uv, take.K, take.T, take_axis=0)
+    expected = np.ones(uv.shape[:-1], bool)
+    expected[:, 1, ::2] = False
+    np.testing.assert_array_equal(found.inlier_mask, expected)
+    mask = robust(uv, take.K, take.T, mask=expected, take_axis=0)
+    np.testing.assert_allclose(found.points, mask.points, atol=1e-6)
+
+
+def test_the_order_of_views_does_not_matter(takes):
+    take = takes(3, 4, 2.0, 3, outliers=0.1)
+    order = np.array([2, 0, 3, 1])
+    straight = robust(take.uv_px, take.K, take.T, take_axis=0)
+    turned = robust(take.uv_px[:, order], take.K[order], take.T[order], take_axis=0)
+    np.testing.assert_array_equal(straight.inlier_mask[:, order], turned.inlier_mask)
+    np.testing.assert_allclose(straight.points, turned.points, atol=2e-6)
+
+
+@pytest.mark.parametrize("how", ["mask", "nan pixel", "nan confidence", "zero confidence"])
+def test_what_is_masked_changes_nothing(takes, how):
+    take = takes(3, 4, 1.0, 4)
+    uv, confidence, mask = take.uv_px.copy(), np.ones(take.uv_px.shape[:-1], np.float32), None
+    if how == "mask":
+        mask = np.ones(uv.shape[:-1], bool)
+        mask[:, 3] = False
+        uv[:, 3] = 1e9
+    elif how == "nan pixel":
+        uv[:, 3] = np.nan
+    else:
+        confidence[:, 3] = np.nan if how == "nan confidence" else 0
+    found = robust(uv, take.K, take.T, confidence, mask, take_axis=0)
+    three = robust(take.uv_px[:, :3], take.K[:3], take.T[:3], take_axis=0)
+    np.testing.assert_allclose(found.points, three.points, atol=2e-6)
+    np.testing.assert_allclose(found.sigma_m, three.sigma_m, rtol=1e-3)
+
+
+def test_joints_seen_by_one_view_are_not_invented(takes):
+    take = takes(3, 4, 1.0, 5)
+    uv = take.uv_px.copy()
+    uv[:, 1:, 4] = np.nan
+    found = robust(uv, take.K, take.T, take_axis=0)
+    assert not found.valid[:, 4].any()
+    assert bool(np.delete(np.asarray(found.valid), 4, axis=1).all())
+    assert (np.asarray(found.points)[:, 4] == 0).all()
+    assert not found.inlier_mask[:, :, 4].any()
+
+
+def test_projection_jacobian_matches_differences(takes, float64):
+    take = takes(1, 2, 0.0, 6)
+    points = jnp.asarray(take.joints, jnp.float64)[0]
+    K, T = take.K.astype(float), take.T.astype(float)
+    pixels, J = projection_jacobian(K, T, points)
+    np.testing.assert_allclose(pixels, project(K, T, points[None])[0], rtol=1e-9)
+    for c in range(3):
+        step = 1e-6 * np.eye(3)[c]
+        ahead, back = (project(K, T, (points + s * step)[None])[0] for s in (1, -1))
+        np.testing.assert_allclose(J[..., c], (ahead - back) / 2e-6, rtol=1e-5, atol=1e-4)
+
+
+def test_gradients_are_finite_and_right(takes, float64):
+    take = takes(1, 3, 1.0, 7)
+    uv, K, T = (jnp.asarray(x, jnp.float64) for x in (take.uv_px[0], take.K, take.T))
+    value = jax.jit(lambda uv: triangulate_robust(uv, K, T).points[3, 0])
+    gradient = jax.grad(value)(uv)
+    assert bool(jnp.isfinite(gradient).all())
+    step = jnp.zeros_like(uv).at[1, 3, 0].set(1e-3)
+    assert gradient[1, 3, 0] == pytest.approx(float(value(uv + step) - value(uv - step)) / 2e-3, rel=1e-2)
+
+
+def test_sigma_is_calibrated(takes):
+    """Per coordinate: the share of |error| below the standard deviation of that coordinate."""
+    take = takes(60, 4, 2.0, 8)
+    found = robust(take.uv_px, take.K, take.T, take_axis=0)
+    deviation = np.sqrt(np.diagonal(found.covariance, axis1=-2, axis2=-1))
+    inside = np.abs(found.points - take.joints) < deviation
+    assert 0.6 < inside.mean() < 0.76
+    assert float(found.sigma_px[0]) == pytest.approx(2.0, rel=0.1)
+
+
+def test_bad_shapes_raise(takes):
+    take = takes(1, 3, 0.0, 9)
+    with pytest.raises(ValueError, match="at least two views"):
+        triangulate_robust(take.uv_px[:, :1], take.K[:1], take.T[:1])
+    with pytest.raises(ValueError, match="3 views, the cameras 2"):
+        triangulate_robust(take.uv_px, take.K[:2], take.T[:2])
