@@ -1,0 +1,403 @@
+"""The released models, on procedural weights, against what the authors' code stored (FACTS section 13).
+
+The tables are what the tests run over, so that no stored array is listed without being compared;
+`test_golden_coverage.py` sees to it that none is missing from them.
+
+Two runs of one function in float32 differ: block 0 by 1e-6 m, and from block 1 on a query may read another
+32nd neighbour, where the 32nd and the 33rd are equally near. About one search in 2,400 does; that moves its
+query by up to 5 mm, those that read it later by less, and all vertices of the parametric model by 0.1 mm. In
+the same way the stored float32 runs differ from the stored float64 runs, which we meet in float64 at every
+point (`test_release_stages.py`). Here float32 meets float32, and 99.5 % of the points agree to 2e-5 m
+(parametric: 1e-4 m): as they are, or where more than 0.5 % hang on ties, once the ties are resolved as in the
+stored run. How many do is a matter of the rounding of either side, so of the machine and of the program; on
+the first machine it is more than that for small B and C, large A, and the parametric model on A, B and C.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import poem_jax
+from poem_jax.batch import MultiViewBatch, Prediction
+from poem_jax.geometry.cameras import Cameras
+from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.hand.model import HandModel
+from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
+from poem_jax.losses import RELEASE, multi_view_losses
+from poem_jax.models import poem
+from tests.weights.halves import look, reconstruct
+from tests.weights.procedural import (
+    IMAGE_HW,
+    batch_of,
+    golden,
+    in_float32,
+    known_root,
+    needs_reference,
+    released,
+    samples,
+    stack_samples,
+)
+
+pytestmark = needs_reference
+
+
+class Case(NamedTuple):
+    """A model and the inputs that it was run on."""
+
+    model: str
+    inputs: str
+
+    def __str__(self) -> str:
+        return f"{self.model}_{self.inputs}"
+
+    @property
+    def stored(self) -> dict[str, np.ndarray]:
+        return golden(str(self))
+
+
+CASES = [
+    Case(model, name)
+    for model, names in {"small": "DABC", "medium": "ABC", "large": "AC", "medium_MANO": "ABC"}.items()
+    for name in names
+]
+FAST = Case("small", "D")
+"""The end-to-end case of the default suite."""
+PARAMETRIC = "medium_MANO"
+
+KEYPOINT_PX, REFERENCE_JOINT_M, FIRST_BLOCK_M = 1e-3, 1e-5, 1e-5
+SHARE, FARTHEST_M = 0.995, 5e-3
+TIE, TIE_UNDER_MESH = 1e-5, 3e-6
+"""Squared distances (in units of 10 cm) that two runs may order differently; the gap is typically 1e-3. The
+second is for searches whose outcome cannot be seen one by one: there each tie is tried."""
+MANY, MANY_UNDER_MESH = 0.98, 0.7
+"""Shares of points that agree if several ties end otherwise; one moves a whole mesh, if only by 0.1 mm."""
+MOST_SWAPS = 12
+"""Searches of a case that may have to end otherwise; there are 3,196 per sample."""
+
+
+def limit_m(model: str, block: int) -> float:
+    return 1e-4 if model == PARAMETRIC and block == 2 else 2e-5
+
+
+def parity(case: Case) -> list[pytest.MarkDecorator]:
+    return [] if case == FAST else [pytest.mark.parity]
+
+
+def close(ours: np.ndarray, theirs: np.ndarray, atol: float) -> None:
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
+
+
+# Final outputs, float32.
+
+
+@functools.cache
+def predicted(case: Case) -> Prediction:
+    config, params = released(case.model)
+    batch = batch_of(case.inputs)
+    prediction = poem_jax.apply(
+        params, batch.views, batch.cameras, config=config, root_world=known_root(batch)
+    )
+    return jax.tree.map(np.asarray, prediction)
+
+
+def final(case: Case) -> Prediction:
+    """What is compared beyond block 0: our prediction, or one with its ties resolved as in the stored run."""
+    ours = predicted(case)
+    agree = [share_within(case, ours, block) >= SHARE for block in (1, 2)]
+    return ours if all(agree) else resolved(case).prediction
+
+
+def share_within(case: Case, prediction: Prediction, block: int) -> float:
+    return float(np.mean(distances(case, prediction, block) <= limit_m(case.model, block)))
+
+
+def distances(case: Case, prediction: Prediction, block: int) -> np.ndarray:
+    return np.linalg.norm(prediction.layers_world[block] - case.stored["all_coords_preds"][block], axis=-1)
+
+
+def assert_points_agree(distance_m: np.ndarray, limit: float) -> None:
+    share = np.mean(distance_m <= limit)
+    assert share >= SHARE, f"{share:.4f} of the points are within {limit} m"
+    assert distance_m.max() <= FARTHEST_M
+
+
+def check_keypoints(case: Case, key: str) -> None:
+    seen = batch_of(case.inputs).cameras.view_mask
+    close(predicted(case).keypoints_px[seen], case.stored[key], KEYPOINT_PX)
+
+
+def check_reference_joints(case: Case, key: str) -> None:
+    """Where every sample has one view, the release takes the joints that it is given."""
+    batch, theirs = batch_of(case.inputs), case.stored[key]
+    if known_root(batch) is None:
+        close(predicted(case).reference_joints_world, theirs, REFERENCE_JOINT_M)
+    else:
+        np.testing.assert_array_equal(theirs, batch.joints_world)
+        close(predicted(case).root_world, theirs[:, ROOT_JOINT], 1e-7)
+
+
+def check_blocks(case: Case, key: str) -> None:
+    close(predicted(case).layers_world[0], case.stored[key][0], FIRST_BLOCK_M)
+    for block in (1, 2):
+        assert_points_agree(distances(case, final(case), block), limit_m(case.model, block))
+
+
+def check_joints(case: Case, key: str) -> None:
+    check_last_points(case, final(case).joints_world, case.stored[key])
+
+
+def check_vertices(case: Case, key: str) -> None:
+    check_last_points(case, final(case).vertices_world, case.stored[key])
+
+
+def check_last_points(case: Case, ours: np.ndarray, theirs: np.ndarray) -> None:
+    """Joints are few: one that hangs on a tie is 0.5 % or more of them, so the limit is on all but one."""
+    distance = np.linalg.norm(ours - theirs, axis=-1).ravel()
+    beyond = np.sum(distance > limit_m(case.model, 2))
+    assert beyond <= max(1, (1 - SHARE) * distance.size)
+    assert distance.max() <= FARTHEST_M
+
+
+def check_pose(case: Case, key: str) -> None:
+    """Turns by a and by 2 pi - a the other way are one rotation; numbers follow the mesh's 1e-4 of 0.1 m."""
+    ours, theirs = (rotation_from_axis_angle(pose) for pose in (final(case).pose, case.stored[key]))
+    close(ours, theirs, 1e-3)
+
+
+def check_shape(case: Case, key: str) -> None:
+    close(final(case).shape, case.stored[key], 1e-3)
+
+
+LOSS_TERMS = {
+    "heatmap_joints": "keypoints",
+    "3d_joints": "joints",
+    "3d_joints_from_mesh": "regressed_joints",
+    "3d_verts": "vertices",
+    "2d_joints": "reprojection",
+    "pose": "pose",
+    "shape": "shape",
+}
+"""The stored names, and those of `multi_view_losses`."""
+SUMMED_LOSSES = ("recon", "")
+"""Everything but the heat maps' term, and everything."""
+
+
+@functools.cache
+def losses(case: Case) -> dict[str, float]:
+    """The training loss of our test-mode outputs, under the stored names."""
+    config, params = released(case.model)
+    evaluate = jax.jit(
+        functools.partial(
+            multi_view_losses, image_hw=IMAGE_HW, recipe=RELEASE, query_order=config.decoder.query_order
+        )
+    )
+    batch, hand = in_float32(batch_of(case.inputs)), HandModel(**params["constants"]["hand"])
+    loss, terms = jax.tree.map(float, evaluate(final(case), batch, hand=hand))
+    named = {f"testmode_loss_{name}": terms[ours] for name, ours in LOSS_TERMS.items() if ours in terms}
+    recon = loss - RELEASE.keypoints * terms["keypoints"]
+    return named | {"testmode_loss": loss, "testmode_loss_recon": recon}
+
+
+def check_loss(case: Case, key: str) -> None:
+    """Before its ties are resolved, the parametric model's losses differ by up to 4e-4 of themselves."""
+    np.testing.assert_allclose(losses(case)[key], case.stored[key], rtol=1e-4)
+
+
+OUTPUTS = {
+    "pred_joints_uv": check_keypoints,
+    "pred_ref_joints_3d": check_reference_joints,
+    "all_coords_preds": check_blocks,
+    "pred_joints_3d": check_joints,
+    "pred_verts_3d": check_vertices,
+}
+PARAMETERS = {"pred_pose": check_pose, "pred_shape": check_shape}
+
+
+def output_checks(case: Case) -> dict[str, Callable[[Case, str], None]]:
+    parametric = case.model == PARAMETRIC
+    terms = [name for name in LOSS_TERMS if parametric or name not in ("pose", "shape")]
+    names = [f"testmode_loss_{name}".rstrip("_") for name in (*terms, *SUMMED_LOSSES)]
+    return OUTPUTS | (PARAMETERS if parametric else {}) | dict.fromkeys(names, check_loss)
+
+
+COMPARED = [(case, key, check) for case in CASES for key, check in output_checks(case).items()]
+
+
+@pytest.mark.parametrize(
+    ("case", "key", "check"),
+    [pytest.param(*row, marks=parity(row[0]), id=f"{row[0]}-{row[1]}") for row in COMPARED],
+)
+def test_outputs(case: Case, key: str, check: Callable[[Case, str], None]) -> None:
+    check(case, key)
+
+
+# Ties, float32.
+
+
+class Resolved(NamedTuple):
+    """A run whose searches end as those of the stored run did, wherever two ends are equally near."""
+
+    prediction: Prediction
+    gaps: np.ndarray
+    swapped: np.ndarray
+
+
+SEARCHES = {1: slice(0, 2), 2: slice(2, 4)}
+"""Every block from the second on searches among the basis points, then among the queries."""
+
+
+class Rerun:
+    """The second half of a model on one case, for a choice of ties."""
+
+    def __init__(self, case: Case) -> None:
+        self.case, self.batch = case, batch_of(case.inputs)
+        self.config, self.params = released(case.model)
+        self.seen, _ = look(self.params, self.batch.views, config=self.config)
+        root = known_root(self.batch)
+        self.root = np.full((len(self.batch.views), 3), np.nan, np.float32) if root is None else root
+
+    def __call__(self, swapped: np.ndarray) -> Resolved:
+        cams = self.batch.cameras
+        found = reconstruct(self.params, self.seen, cams, self.root, swapped, config=self.config)
+        return Resolved(*jax.tree.map(np.asarray, found[:2]), swapped)
+
+    def error(self, run: Resolved) -> np.ndarray:
+        return np.sum(distances(self.case, run.prediction, 2) ** 2, -1)
+
+
+@functools.cache
+def resolved(case: Case) -> Resolved:
+    rerun = Rerun(case)
+    run = rerun(np.zeros((4, len(rerun.root), NUM_QUERIES), bool))
+    for block, searches in SEARCHES.items():
+        if case.model == PARAMETRIC and block == 2:
+            return resolve_under_mesh(rerun, run)
+        gaps, swapped = run.gaps[searches], run.swapped.copy()
+        astray = distances(case, run.prediction, block) > limit_m(case.model, block)
+        swapped[searches] = (gaps < TIE) & (gaps == gaps.min(0)) & astray
+        run = rerun(swapped)
+    return run
+
+
+def resolve_under_mesh(rerun: Rerun, run: Resolved) -> Resolved:
+    """Resolve the ties of the parametric model's last block.
+
+    Its queries are not stored, only the mesh, which hangs on all of them: swap one tie of every sample at a
+    time, the closest first, and keep what brings that sample's mesh nearer.
+    """
+    samples = np.arange(run.gaps.shape[1])
+    gaps = np.swapaxes(run.gaps[SEARCHES[2]], 0, 1).reshape(len(samples), -1)
+    kept, error = run.swapped, rerun.error(run)
+    for places in np.argsort(gaps, axis=1)[:, : np.max(np.sum(gaps < TIE_UNDER_MESH, 1))].T:
+        if np.sqrt(error.max()) <= limit_m(PARAMETRIC, 2):
+            break
+        swapped = kept.copy()
+        is_tie = gaps[samples, places] < TIE_UNDER_MESH
+        swapped[SEARCHES[2]][places // NUM_QUERIES, samples, places % NUM_QUERIES] |= is_tie
+        trial = rerun.error(rerun(swapped))
+        kept = np.where((trial < error)[:, None], swapped, kept)
+        error = np.minimum(trial, error)
+    return rerun(kept)
+
+
+@pytest.mark.parity
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_ties_are_what_separates_the_runs(case: Case) -> None:
+    """Where ties had to be resolved, these are few, and their ends as good as equally near."""
+    if final(case) is predicted(case):
+        return
+    run = resolved(case)
+    assert 0 < run.swapped.sum() <= MOST_SWAPS
+    assert run.gaps[run.swapped].max() < TIE
+    assert np.median(run.gaps) > 20 * TIE
+
+
+@pytest.mark.parity
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_share_of_points_before_ties_are_resolved(case: Case) -> None:
+    many = MANY_UNDER_MESH if case.model == PARAMETRIC else MANY
+    assert share_within(case, predicted(case), 1) >= SHARE
+    assert share_within(case, predicted(case), 2) >= many
+    assert distances(case, predicted(case), 2).max() <= FARTHEST_M
+
+
+# Masks.
+
+PLACES = {"behind": [[0, 1, 2], [0, 1], [0, 1, 2, 3]], "between": [[1, 4, 7], [0, 5], [2, 3, 5, 6]]}
+"""Where the valid views of the samples of case A stand among 8; the others hold garbage."""
+
+
+def amid_garbage(batch: MultiViewBatch, places: list[list[int]]) -> MultiViewBatch:
+    rng, shape = np.random.default_rng(0), (len(places), 8)
+    views = rng.integers(0, 256, (*shape, *IMAGE_HW, 3), np.uint8)
+    K, T = np.full((*shape, 3, 3), np.nan, np.float32), rng.normal(size=(*shape, 4, 4))
+    mask = np.zeros(shape, bool)
+    for b, slots in enumerate(places):
+        valid = batch.cameras.view_mask[b]
+        views[b, slots], mask[b, slots] = batch.views[b, valid], True
+        K[b, slots], T[b, slots] = batch.cameras.K[b, valid], batch.cameras.T_cam_from_world[b, valid]
+    return batch._replace(views=views, cameras=Cameras(K, T, mask))
+
+
+@functools.cache
+def masked_runs() -> tuple[dict[str, Prediction], list[int]]:
+    """Run the small model on case A amid garbage; also count the compiled programs after every run."""
+    config, params = released("small")
+    found, programs = {}, []
+    for name, places in PLACES.items():
+        batch = amid_garbage(batch_of("A"), places)
+        prediction = poem_jax.apply(params, batch.views, batch.cameras, config=config)
+        found[name] = jax.tree.map(np.asarray, prediction)
+        programs.append(poem._predict._cache_size())
+    return found, programs
+
+
+def assert_same(ours: Prediction, other: Prediction) -> None:
+    """Compare two programs of ours, which may round differently; a view too many would move every point."""
+    close(ours.layers_world[0], other.layers_world[0], 1e-6)
+    for block in (1, 2):
+        gap = np.linalg.norm(ours.layers_world[block] - other.layers_world[block], axis=-1)
+        assert np.median(gap) < 1e-6
+        assert np.mean(gap <= limit_m("small", block)) >= MANY
+        assert gap.max() <= FARTHEST_M
+
+
+@pytest.mark.parity
+@pytest.mark.parametrize("where", PLACES)
+def test_masked_views_change_nothing(where: str) -> None:
+    alone, masked = predicted(Case("small", "A")), masked_runs()[0][where]
+    for b, slots in enumerate(PLACES[where]):
+        close(masked.keypoints_px[b, slots], alone.keypoints_px[b, : len(slots)], 1e-4)
+    assert_same(masked, alone)
+
+
+@pytest.mark.parity
+def test_new_masks_compile_nothing() -> None:
+    first, second = masked_runs()[1]
+    assert second == first
+
+
+@pytest.mark.parity
+def test_batch_of_mixed_view_counts_equals_each_sample_alone() -> None:
+    """8, 5, 3 views and 1; the root is given for the single view, for which the release has none in a mix."""
+    config, params = released("small")
+    mixed = stack_samples([*samples("B"), next(samples("A")), *samples("C")])
+    np.testing.assert_array_equal(mixed.cameras.view_mask.sum(-1), [8, 5, 3, 1])
+    roots = np.full((4, 3), np.nan, np.float32)
+    roots[-1] = mixed.joints_world[-1, ROOT_JOINT]
+
+    def run(rows: slice) -> Prediction:
+        cams = Cameras(*(leaf[rows] for leaf in mixed.cameras))
+        found = poem_jax.apply(params, mixed.views[rows], cams, config=config, root_world=roots[rows])
+        return jax.tree.map(np.asarray, found)
+
+    together, alone = run(slice(None)), [run(slice(b, b + 1)) for b in range(4)]
+    seen = mixed.cameras.view_mask
+    apart = np.concatenate([prediction.keypoints_px for prediction in alone])
+    close(together.keypoints_px[seen], apart[seen], 1e-4)
+    layers = np.concatenate([prediction.layers_world for prediction in alone], 1)
+    assert_same(together, together._replace(layers_world=layers))
