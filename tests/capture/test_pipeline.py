@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import types
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.io.meshes import read_mesh
+from poem_jax.models.config import Config
 from poem_jax.models.inference import Prepared
 from poem_jax.viz.overlay import MeshInView, silhouette
 
@@ -269,7 +269,7 @@ def stub_engine(vertices, joints, root, valid=True):
         solved = valid & cams.view_mask.any(-1)
         return Prediction(vertices, joints, root, keypoints, layers, solved)
 
-    config = types.SimpleNamespace(image_hw=(64, 64))
+    config = Config(image_hw=(64, 64))
     params = {"constants": {"hand": {"faces": default_hand().faces}}}
     return Engine(config, Prepared(params, None, config), len(vertices), answer, "stub")
 
