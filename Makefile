@@ -35,7 +35,7 @@ test-browser: setup
 	$(BIN)/python -m pytest -m browser
 
 test-parity: setup
-	$(PYTEST) -m parity
+	$(PYTEST) -m "parity and not slow"
 
 test-slow: setup
 	$(PYTEST) -m slow

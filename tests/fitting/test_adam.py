@@ -12,6 +12,7 @@ from poem_jax.hand.mano_file import load
 
 
 @pytest.mark.parity
+@pytest.mark.slow
 def test_the_released_recipe_follows_the_release(shared_dir):
     """Losses to step 75 and states to step 50 within 1e-3.
 

@@ -147,6 +147,7 @@ def test_anatomy_gradients(model64, rng):
 
 
 @pytest.mark.parity
+@pytest.mark.slow
 def test_anatomy_is_the_release(shared_dir):
     from poem_jax.fitting.kinematics import keypoint_model
 

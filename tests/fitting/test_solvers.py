@@ -153,6 +153,7 @@ def test_bad_input_raises(model, takes):
 
 
 @pytest.mark.parity
+@pytest.mark.slow
 def test_released_key_points(shared_dir):
     """The stand-in hand bends any way: limits and prior of human joints say nothing about it."""
     folder = shared_dir / "reference" / "poem_v1"

@@ -174,6 +174,7 @@ def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_sce
 
 
 @pytest.mark.parity
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "largest"),
     [("v2-base", 1e-5), ("v2-medium-release", 1e-5), ("v2-medium-mano-release", 1e-4)],

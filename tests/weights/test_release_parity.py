@@ -42,7 +42,7 @@ from tests.weights.procedural import (
     stack_samples,
 )
 
-pytestmark = needs_reference
+pytestmark = [needs_reference, pytest.mark.slow]
 
 
 class Case(NamedTuple):

@@ -19,7 +19,7 @@ from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
 from tests.weights.halves import look, reconstruct
 from tests.weights.procedural import IMAGE_HW, batch_of, golden, needs_reference, released, weight
 
-pytestmark = [needs_reference, pytest.mark.parity]
+pytestmark = [needs_reference, pytest.mark.parity, pytest.mark.slow]
 
 RECORDED = ("small", "medium", "medium_MANO")
 """Models whose intermediates are stored, all of case A."""

@@ -41,7 +41,7 @@ from tests.weights.procedural import (
     released,
 )
 
-pytestmark = [needs_reference, pytest.mark.parity]
+pytestmark = [needs_reference, pytest.mark.parity, pytest.mark.slow]
 
 FILE = "train_small_G"
 LOSS_TERMS = {
