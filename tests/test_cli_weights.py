@@ -22,6 +22,7 @@ from poem_jax.cli import USAGE_ERROR, main
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.template import default_hand
+from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.io.torch_file import load_state_dict, save_state_dict
 from poem_jax.models.config import Config, HRNetConfig
 from poem_jax.models.presets import PRESETS
@@ -43,7 +44,7 @@ def shrunken(config: Config, width: int = 16) -> Config:
         config,
         width=width,
         backbone=HRNetConfig(width=2, stem_channels=4, stem_blocks=2, modules=(1, 1, 1), blocks=1),
-        basis=replace(config.basis, num_points=64),
+        basis=replace(config.basis, num_points=NUM_QUERIES),
         decoder=replace(config.decoder, num_neighbours=4),
     )
 
@@ -240,7 +241,7 @@ def test_an_older_model_goes_only_when_asked(tmp_path, capsys, release):
     out = tmp_path / "out"
     assert main(release.command(out)) == 0
     before = contents(out)
-    np.save(release.folder / "assets" / "bps.npy", np.zeros((64, 3), np.float32))
+    np.save(release.folder / "assets" / "bps.npy", np.zeros((NUM_QUERIES, 3), np.float32))
     assert main(release.command(out)) == USAGE_ERROR
     assert "out exists already; give another folder, or --overwrite" in capsys.readouterr().err
     assert contents(out) == before
@@ -327,7 +328,7 @@ FAILURES: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
     "shape": (
         lambda folder: np.save(folder / "assets/bps.npy", np.zeros((2, 64, 3))),
         [],
-        r"bps\.npy must hold floating numbers of shape \(64, 3\) or \(1, 64, 3\); got .*\(2, 64, 3\)",
+        r"bps\.npy must hold floating numbers of shape \(799, 3\) or \(1, 799, 3\); got .*\(2, 64, 3\)",
     ),
     "type": (
         lambda folder: np.save(folder / "assets/anchor_idx.npy", np.zeros(4)),

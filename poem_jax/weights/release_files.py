@@ -63,7 +63,7 @@ def import_release(
         mano: `MANO_RIGHT.pkl`, or an `.npz` with MANO's names.
         assets: folder with `bps.npy`, `anchor.npy`, `anchor_idx.npy`.
         out: folder to make; on failure nothing is left there, and what stood there stays.
-        accept_anchors: take anchors that do not lie on the template of the checkpoint's hand.
+        accept_anchors: take anchors that do not lie on the template of `mano` and of the checkpoint.
         overwrite: replace the model folder at `out`.
 
     Raises:
@@ -78,7 +78,7 @@ def import_release(
     state = load_state_dict(checkpoint)
     _, params = convert(state, variant, mano=hand, **constants._asdict())
     if not accept_anchors:
-        check_anchors(config, params)
+        check_anchors(config, params, hand)
     store.save(out, config, params, overwrite=overwrite)
     num_read = _num_read(state, config)
     num_parameters = sum(leaf.size for leaf in jax.tree.leaves(params["trainable"]))

@@ -157,21 +157,23 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: P
     return unflatten({**flatten(params), **leaves}, params)
 
 
-def check_anchors(config: Config, params: Params) -> None:
-    """Insist that the anchors of an imported model stand where its template has the points that they name.
+def check_anchors(config: Config, params: Params, hand: HandModel) -> None:
+    """Insist that the anchors of an imported model stand where the points that they name are, on the template
+    that it carries and on that of `hand`.
 
     Raises:
         ValueError: they do not; the hand is another one than the weights were trained with.
     """
     constants = params["constants"]
     anchors, radius = constants["anchors"], config.basis.radius
-    places = np.asarray(constants["template_queries"])[np.asarray(anchors["index"])]
-    gaps = np.linalg.norm(radius * np.asarray(anchors["positions"]) - places, axis=-1)
+    templates = np.stack([constants["template_queries"], template_queries(hand, config.decoder.query_order)])
+    places = templates[:, np.asarray(anchors["index"])]
+    gaps = np.linalg.norm(radius * np.asarray(anchors["positions"]) - places, axis=-1).max(0)
     if gaps.max() > _ON_TEMPLATE_M:
         raise ValueError(
             f"the anchors must lie on the template of the hand; {int((gaps > _ON_TEMPLATE_M).sum())} of "
-            f"{len(gaps)} are up to {1000 * gaps.max():.1f} mm away. Give the anchors and the checkpoint "
-            "of one release, or accept other anchors with --accept-anchors"
+            f"{len(gaps)} are up to {1000 * gaps.max():.1f} mm away. Give the anchors, checkpoint "
+            "and hand of one release, or accept other anchors with --accept-anchors"
         )
 
 
