@@ -64,7 +64,7 @@ def make_take(frames: int, views: int, noise_px: float, outliers: float, seed: i
     """Draw a take; outliers lie 50 px off in any direction."""
     rng = np.random.default_rng(seed)
     pose = sample_pose(rng, frames)
-    pose[:, 0] = Rotation.random(frames, seed).as_rotvec()
+    pose[:, 0] = Rotation.random(frames, rng).as_rotvec()
     shape = np.tile(rng.normal(size=10), (frames, 1))
     place = rng.uniform(-0.08, 0.08, (frames, 3))
     pose, shape, place = (x.astype(np.float32) for x in (pose, shape, place))
