@@ -3,14 +3,11 @@
 The tables are what the tests run over, so that no stored array is listed without being compared;
 `test_golden_coverage.py` sees to it that none is missing from them.
 
-Two runs of one function in float32 differ: block 0 by 1e-6 m, and from block 1 on a query may read another
-32nd neighbour, where the 32nd and the 33rd are equally near. About one search in 2,400 does; that moves its
-query by up to 5 mm, those that read it later by less, and all vertices of the parametric model by 0.1 mm. In
-the same way the stored float32 runs differ from the stored float64 runs, which we meet in float64 at every
-point (`test_release_stages.py`). Here float32 meets float32, and 99.5 % of the points agree to 2e-5 m
-(parametric: 1e-4 m): as they are, or where more than 0.5 % hang on ties, once the ties are resolved as in the
-stored run. How many do is a matter of the rounding of either side, so of the machine and of the program; on
-the first machine it is more than that for small B and C, large A, and the parametric model on A, B and C.
+Float32 meets float32 here, and 99.5 % of the points agree to 2e-5 m (parametric: 1e-4 m): as they are, or
+where more than 0.5 % hang on ties between neighbours (`ties.py`), once these are resolved as in the stored
+run. How many do is a matter of the rounding of either side, so of machine and program; on the first machine
+it is more than that for small B and C, large A, and the parametric model on A, B and C. In float64 there are
+no ties, and every point agrees (`test_release_stages.py`).
 """
 
 import functools
@@ -26,10 +23,9 @@ from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import HandModel
-from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
+from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.losses import RELEASE, multi_view_losses
 from poem_jax.models import poem
-from tests.weights.halves import look, reconstruct
 from tests.weights.procedural import (
     IMAGE_HW,
     batch_of,
@@ -40,6 +36,17 @@ from tests.weights.procedural import (
     released,
     samples,
     stack_samples,
+)
+from tests.weights.ties import (
+    FARTHEST_M,
+    PARAMETRIC,
+    SHARE,
+    Rerun,
+    Run,
+    assert_only_ties,
+    assert_points_agree,
+    limit_m,
+    resolve,
 )
 
 pytestmark = [needs_reference, pytest.mark.slow]
@@ -66,21 +73,9 @@ CASES = [
 ]
 FAST = Case("small", "D")
 """The end-to-end case of the default suite."""
-PARAMETRIC = "medium_MANO"
-
 KEYPOINT_PX, REFERENCE_JOINT_M, FIRST_BLOCK_M = 1e-3, 1e-5, 1e-5
-SHARE, FARTHEST_M = 0.995, 5e-3
-TIE, TIE_UNDER_MESH = 1e-5, 3e-6
-"""Squared distances (in units of 10 cm) that two runs may order differently; the gap is typically 1e-3. The
-second is for searches whose outcome cannot be seen one by one: there each tie is tried."""
 MANY, MANY_UNDER_MESH = 0.98, 0.7
 """Shares of points that agree if several ties end otherwise; one moves a whole mesh, if only by 0.1 mm."""
-MOST_SWAPS = 12
-"""Searches of a case that may have to end otherwise; there are 3,196 per sample."""
-
-
-def limit_m(model: str, block: int) -> float:
-    return 1e-4 if model == PARAMETRIC and block == 2 else 2e-5
 
 
 def parity(case: Case) -> list[pytest.MarkDecorator]:
@@ -111,18 +106,17 @@ def final(case: Case) -> Prediction:
     return ours if all(agree) else resolved(case).prediction
 
 
+@functools.cache
+def resolved(case: Case) -> Run:
+    return resolve(Rerun(case.model, batch_of(case.inputs), case.stored["all_coords_preds"]))
+
+
 def share_within(case: Case, prediction: Prediction, block: int) -> float:
     return float(np.mean(distances(case, prediction, block) <= limit_m(case.model, block)))
 
 
 def distances(case: Case, prediction: Prediction, block: int) -> np.ndarray:
     return np.linalg.norm(prediction.layers_world[block] - case.stored["all_coords_preds"][block], axis=-1)
-
-
-def assert_points_agree(distance_m: np.ndarray, limit: float) -> None:
-    share = np.mean(distance_m <= limit)
-    assert share >= SHARE, f"{share:.4f} of the points are within {limit} m"
-    assert distance_m.max() <= FARTHEST_M
 
 
 def check_keypoints(case: Case, key: str) -> None:
@@ -235,85 +229,11 @@ def test_outputs(case: Case, key: str, check: Callable[[Case, str], None]) -> No
     check(case, key)
 
 
-# Ties, float32.
-
-
-class Resolved(NamedTuple):
-    """A run whose searches end as those of the stored run did, wherever two ends are equally near."""
-
-    prediction: Prediction
-    gaps: np.ndarray
-    swapped: np.ndarray
-
-
-SEARCHES = {1: slice(0, 2), 2: slice(2, 4)}
-"""Every block from the second on searches among the basis points, then among the queries."""
-
-
-class Rerun:
-    """The second half of a model on one case, for a choice of ties."""
-
-    def __init__(self, case: Case) -> None:
-        self.case, self.batch = case, batch_of(case.inputs)
-        self.config, self.params = released(case.model)
-        self.seen, _ = look(self.params, self.batch.views, config=self.config)
-        root = known_root(self.batch)
-        self.root = np.full((len(self.batch.views), 3), np.nan, np.float32) if root is None else root
-
-    def __call__(self, swapped: np.ndarray) -> Resolved:
-        cams = self.batch.cameras
-        found = reconstruct(self.params, self.seen, cams, self.root, swapped, config=self.config)
-        return Resolved(*jax.tree.map(np.asarray, found[:2]), swapped)
-
-    def error(self, run: Resolved) -> np.ndarray:
-        return np.sum(distances(self.case, run.prediction, 2) ** 2, -1)
-
-
-@functools.cache
-def resolved(case: Case) -> Resolved:
-    rerun = Rerun(case)
-    run = rerun(np.zeros((4, len(rerun.root), NUM_QUERIES), bool))
-    for block, searches in SEARCHES.items():
-        if case.model == PARAMETRIC and block == 2:
-            return resolve_under_mesh(rerun, run)
-        gaps, swapped = run.gaps[searches], run.swapped.copy()
-        astray = distances(case, run.prediction, block) > limit_m(case.model, block)
-        swapped[searches] = (gaps < TIE) & (gaps == gaps.min(0)) & astray
-        run = rerun(swapped)
-    return run
-
-
-def resolve_under_mesh(rerun: Rerun, run: Resolved) -> Resolved:
-    """Resolve the ties of the parametric model's last block.
-
-    Its queries are not stored, only the mesh, which hangs on all of them: swap one tie of every sample at a
-    time, the closest first, and keep what brings that sample's mesh nearer.
-    """
-    samples = np.arange(run.gaps.shape[1])
-    gaps = np.swapaxes(run.gaps[SEARCHES[2]], 0, 1).reshape(len(samples), -1)
-    kept, error = run.swapped, rerun.error(run)
-    for places in np.argsort(gaps, axis=1)[:, : np.max(np.sum(gaps < TIE_UNDER_MESH, 1))].T:
-        if np.sqrt(error.max()) <= limit_m(PARAMETRIC, 2):
-            break
-        swapped = kept.copy()
-        is_tie = gaps[samples, places] < TIE_UNDER_MESH
-        swapped[SEARCHES[2]][places // NUM_QUERIES, samples, places % NUM_QUERIES] |= is_tie
-        trial = rerun.error(rerun(swapped))
-        kept = np.where((trial < error)[:, None], swapped, kept)
-        error = np.minimum(trial, error)
-    return rerun(kept)
-
-
 @pytest.mark.parity
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_ties_are_what_separates_the_runs(case: Case) -> None:
-    """Where ties had to be resolved, these are few, and their ends as good as equally near."""
-    if final(case) is predicted(case):
-        return
-    run = resolved(case)
-    assert 0 < run.swapped.sum() <= MOST_SWAPS
-    assert run.gaps[run.swapped].max() < TIE
-    assert np.median(run.gaps) > 20 * TIE
+def test_what_is_resolved_are_ties(case: Case) -> None:
+    if final(case) is not predicted(case):
+        assert_only_ties(resolved(case))
 
 
 @pytest.mark.parity

@@ -18,12 +18,12 @@ from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
 from tests.weights.halves import look, reconstruct
 from tests.weights.procedural import IMAGE_HW, batch_of, golden, needs_reference, released, weight
+from tests.weights.ties import PARAMETRIC
 
 pytestmark = [needs_reference, pytest.mark.parity, pytest.mark.slow]
 
 RECORDED = ("small", "medium", "medium_MANO")
 """Models whose intermediates are stored, all of case A."""
-PARAMETRIC = "medium_MANO"
 NEGATIVE_SOLUTIONS = (True, False, True)
 """Samples whose root the release found as -v in place of v, the last singular vector: LAPACK's choice. It
 divides by v[3] + 1e-7, so that the two differ by 2e-7 m, which is enough to turn ties between neighbours."""
