@@ -86,9 +86,8 @@ def _print_preset(name: str, views: list[int], mixed: list[int], rounds: int) ->
         cases = [[count] for count in views] + ([mixed] if mixed else [])
         alone = []
         for case in cases:
-            # The plain form takes a mixed batch sample by sample: nothing new to compile or to hold.
-            forms = FORMS if len(case) == 1 else ("optimised",)
             run = {"preset": name, "case": case, "cache": cache}
+            forms = FORMS if len(case) == 1 else ("optimised",)
             alone.append({form: _in_a_process("alone", SETTINGS, form=form, **run) for form in forms})
     print(f"\n### {name}\n\nSeconds, with the allocator settings of the `poem` command:\n")
     _print_table(["views", "", *PARTS, "whole", "whole, without settings"], _time_rows(cases, times, without))
@@ -111,13 +110,15 @@ def _time_rows(cases: list[list[int]], times: dict, without: dict) -> list[list[
     for case in cases:
         columns = [times["parts"].get(_key(case), {}).get(part) for part in PARTS]
         columns += [run["whole"][_key(case)] for run in (times, without)]
-        for form in FORMS:
+        forms = FORMS if len(case) == 1 else ("optimised",)
+        for form in forms:
             cells = ["-" if c is None else f"{_median(c[form]):.3f}" for c in columns]
             rows.append([_title(case), form, *cells])
-        ratios = [
-            "-" if c is None else f"{_median(c['optimised']) / _median(c['plain']):.2f}" for c in columns
-        ]
-        rows.append([_title(case), "optimised / plain", *ratios])
+        if forms == FORMS:
+            ratios = [
+                "-" if c is None else f"{_median(c['optimised']) / _median(c['plain']):.2f}" for c in columns
+            ]
+            rows.append([_title(case), "optimised / plain", *ratios])
     return rows
 
 
@@ -184,10 +185,10 @@ def measure_times(
 ) -> dict:
     """Return seconds of both forms by turns: `whole` and `parts` of every case, and the `first` calls."""
     config, params = _model(preset)
-    counts = list(dict.fromkeys([*views, *mixed]))
-    cases: list[tuple[list[int], tuple[str, ...]]] = [([count], FORMS) for count in counts]
+    cases: list[tuple[list[int], tuple[str, ...]]] = [([count], FORMS) for count in views]
     if mixed:
-        cases.append((mixed, ("optimised",)))
+        others = [[count] for count in mixed if count not in views]
+        cases += [(case, ("optimised",)) for case in (*others, mixed)]
     calls: dict[str, dict[str, Callable]] = {}
     first: dict[str, dict[str, float]] = {}
     for case, forms in cases:
@@ -203,9 +204,6 @@ def measure_times(
         for key, named in by_part.items():
             for part, forms in named.items():
                 _run_by_turns(forms, split[key][part], keep=round_number >= 0)
-    if mixed:
-        one_by_one = zip(*(whole[_key([count])]["plain"] for count in mixed), strict=True)
-        whole[_key(mixed)]["plain"] = [sum(samples) for samples in one_by_one]
     return {"whole": whole, "parts": split, "first": first}
 
 
@@ -252,7 +250,7 @@ JOBS = {"machine": measure_machine, "times": measure_times, "alone": measure_alo
 
 
 def _whole_calls(params, config, case: list[int], forms: tuple[str, ...]) -> dict[str, Callable]:
-    """Return calls of the wanted forms on one batch; the plain form takes its samples one by one."""
+    """Return calls of the wanted forms on one batch; `case` = views per sample."""
     import jax
 
     from poem_jax.models.inference import infer, prepare
@@ -262,8 +260,7 @@ def _whole_calls(params, config, case: list[int], forms: tuple[str, ...]) -> dic
     if "plain" in forms:
         run = _plain_program("plain_forward", config)
         held = jax.device_put(params)
-        samples = [(images[i : i + 1, :n], _sample(cams, i, n), root[i : i + 1]) for i, n in enumerate(case)]
-        calls["plain"] = lambda: [run(held, i, c, root=r)[0] for i, c, r in samples]
+        calls["plain"] = lambda: run(held, images, cams, root=root)
     if "optimised" in forms:
         prepared = prepare(params, config)
         calls["optimised"] = lambda: infer(prepared, images, cams, root_world=root)
@@ -413,12 +410,6 @@ def _scene(config, case: list[int]):
     mask = np.arange(views) < np.array(case)[:, None]
     cams = poem_jax.Cameras(np.tile(K, (batch, views, 1, 1)), T_cam_from_world, mask)
     return images, cams, np.zeros((batch, 3), np.float32)
-
-
-def _sample(cams, index: int, views: int):
-    import poem_jax
-
-    return poem_jax.Cameras(*(leaf[index : index + 1, :views] for leaf in cams))
 
 
 def _keep_programs(folder: str, case: list[int]) -> None:

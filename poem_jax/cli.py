@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from poem_jax.capture.pipeline import Written
+    from poem_jax.capture.results import Written
+    from poem_jax.hand.model import HandModel
 
 USAGE_ERROR = 2
 
@@ -65,12 +66,55 @@ class Reconstruct:
     """Boxes or key points (npz); without it boxes.npz in DIR."""
     checkpoint: _Optional = None
     """Model folder that poem_jax.save wrote; without it the shipped weights."""
+    engine: Literal["network", "fit"] = "network"
+    """fit: no network, the hand model fitted to key points (then --boxes must hold them)."""
     debug: _Flag = False
     """Show the full traceback of an error."""
 
     def run(self) -> None:
         """Write the results and print where they are."""
-        written = _reconstruct(self.folder, self.rig, self.boxes, self.out, self.checkpoint)
+        if self.engine == "fit":
+            if self.checkpoint is not None:
+                raise ValueError("--checkpoint is for --engine network; a fit has no weights")
+            from poem_jax.capture.fit import fit
+            from poem_jax.capture.take import read_take
+
+            written = fit(read_take(self.folder, self.rig, self.boxes), self.out)
+        else:
+            written = _reconstruct(self.folder, self.rig, self.boxes, self.out, self.checkpoint)
+        _print_files(written, self.out)
+        _print_summary(written.report)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit hands to 2D key points from several calibrated cameras; no network, no images needed.
+
+    Writes what `reconstruct` writes, with pose, shape and place of the hand model, and the uncertainty of
+    every joint; see docs/fitting.md.
+    """
+
+    keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
+    """Key points (npz); see docs/captures.md."""
+    rig: _File
+    """Calibration."""
+    out: _Folder
+    """Folder for the results; files of the same name are replaced."""
+    images: _Optional = None
+    """Capture folder with the images to draw on."""
+    mano: _Optional = None
+    """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
+    smooth: _Flag = False
+    """Hold the frames of a take together in a second pass."""
+    debug: _Flag = False
+    """Show the full traceback of an error."""
+
+    def run(self) -> None:
+        """Write the results and print where they are."""
+        from poem_jax.capture.fit import fit, read_keypoint_take
+
+        take = read_keypoint_take(self.keypoints, self.rig, self.images)
+        written = fit(take, self.out, hand=_hand(self.mano), smooth=self.smooth)
         _print_files(written, self.out)
         _print_summary(written.report)
 
@@ -141,7 +185,7 @@ class ExportTorch:
         print(f"torch.load({str(self.out)!r}, weights_only=True)")
 
 
-Command = Demo | Reconstruct | ImportTorch | ExportTorch
+Command = Demo | Reconstruct | Fit | ImportTorch | ExportTorch
 
 
 def start() -> int:
@@ -173,6 +217,7 @@ def _parse(arguments: Sequence[str] | None) -> Command:
     commands = (
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+        | Annotated[Fit, tyro.conf.subcommand("fit")]
         | Annotated[ImportTorch, tyro.conf.subcommand("import-torch")]
         | Annotated[ExportTorch, tyro.conf.subcommand("export-torch")]
     )
@@ -187,9 +232,16 @@ def _parse(arguments: Sequence[str] | None) -> Command:
 def _reconstruct(
     folder: Path, rig: Path | None, boxes: Path | None, out: Path, checkpoint: Path | None
 ) -> "Written":
-    from poem_jax.capture.pipeline import read_take, reconstruct
+    from poem_jax.capture.pipeline import reconstruct
+    from poem_jax.capture.take import read_take
 
     return reconstruct(read_take(folder, rig, boxes), out, checkpoint=checkpoint)
+
+
+def _hand(path: Path | None) -> "HandModel | None":
+    from poem_jax.hand.mano_file import load
+
+    return None if path is None else load(path)
 
 
 def _print_files(written: "Written", out: Path) -> None:

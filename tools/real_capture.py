@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from poem_jax.capture.outputs import write_arrays, write_json
-from poem_jax.capture.pipeline import read_take, reconstruct
+from poem_jax.capture.pipeline import reconstruct
+from poem_jax.capture.take import read_take
 from poem_jax.geometry.alignment import apply_similarity, procrustes
 from poem_jax.hand.topology import WRIST
 

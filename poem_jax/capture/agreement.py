@@ -43,7 +43,7 @@ def judge_take(take: Take, crop_hw: tuple[int, int]) -> Reasons:
         ValueError: A camera is wrong by itself, the cameras are too far apart, or most hands' views do not
             meet. The message says what, expected, got and fix.
     """
-    _check_each_camera(take.rig)
+    check_each_camera(take.rig)
     cams = crop_cameras(take.hands, take.rig, crop_hw)
     check_distances(cams)
     several = cams.view_mask.sum(-1) > 1
@@ -62,7 +62,8 @@ def judge_take(take: Take, crop_hw: tuple[int, int]) -> Reasons:
     return [tuple(reasons[start : start + num_hands]) for start in range(0, len(reasons), num_hands)]
 
 
-def _check_each_camera(rig: Rig) -> None:
+def check_each_camera(rig: Rig) -> None:
+    """Raise ValueError if a camera is wrong by itself, and say which."""
     for view, name in enumerate(rig.names):
         width, height = (int(size) for size in rig.size_wh[view])
         try:

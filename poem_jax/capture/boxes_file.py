@@ -52,6 +52,8 @@ class HandBoxes(NamedTuple):
     """Frame names as the file gives them, None where it gives none."""
     keypoints_px: Float[Array, "frame hand view 21 2"] | None = None
     """OpenPose order; NaN = unseen; None where the file holds boxes alone."""
+    confidence: Float[Array, "frame hand view 21"] | None = None
+    """Of the key points; None where the file gives none."""
 
 
 def read_boxes(path: str | os.PathLike) -> HandBoxes:
@@ -83,16 +85,19 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
             f"{path}: `keypoints_px` and `boxes_px` must agree in frames, hands and views; "
             f"got {keypoints.shape[:3]} and {boxes.shape[:3]}"
         )
-    return HandBoxes(boxes, sides, frames, keypoints)
+    confidence = content.get("confidence") if keypoints is not None else None
+    return HandBoxes(boxes, sides, frames, keypoints, confidence)
 
 
 def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
-    """Write boxes, and key points where there are any; `read_boxes` gives them back."""
+    """Write boxes, key points and confidences where there are any; `read_boxes` gives them back."""
     content = {"boxes_px": boxes.boxes_px, "hand_side": np.array(boxes.hand_side)}
     if boxes.frames is not None:
         content["frames"] = np.array(boxes.frames)
     if boxes.keypoints_px is not None:
         content["keypoints_px"] = boxes.keypoints_px - HALF_PIXEL
+    if boxes.confidence is not None:
+        content["confidence"] = boxes.confidence
     # A stream, since NumPy would add a suffix to a name that has none.
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **content)
@@ -144,11 +149,11 @@ def align_frames(
                 "add `frames (F,)` with the frames' names to the file to say which is which"
             )
         return boxes._replace(frames=names)
-    twice = len(boxes.frames) - len({_frame_key(name) for name in boxes.frames})
+    twice = len(boxes.frames) - len({frame_key(name) for name in boxes.frames})
     if twice:
         raise ValueError(f"{path}: `frames` must differ from each other; got {boxes.frames[:6]}")
-    row = {_frame_key(name): i for i, name in enumerate(boxes.frames)}
-    rows = np.array([row.get(_frame_key(name), -1) for name in names])
+    row = {frame_key(name): i for i, name in enumerate(boxes.frames)}
+    rows = np.array([row.get(frame_key(name), -1) for name in names])
     if (rows < 0).all():
         raise ValueError(
             f"{path}: no frame of the capture ({names[0]}, ...) is among its `frames` {boxes.frames[:4]}"
@@ -158,6 +163,7 @@ def align_frames(
         boxes.hand_side,
         names,
         None if boxes.keypoints_px is None else _take(boxes.keypoints_px, rows),
+        None if boxes.confidence is None else _take(boxes.confidence, rows),
     )
 
 
@@ -166,7 +172,8 @@ def _take(array: Array, rows: Array) -> Array:
     return np.where(found, array[rows], np.nan)
 
 
-def _frame_key(name: str) -> str | int:
+def frame_key(name: str) -> str | int:
+    """Return what makes two names those of one frame: '9' is '0009'."""
     return int(name) if name.isdecimal() else name
 
 

@@ -91,6 +91,8 @@ def frame_report(take: Take, frame: int, outcome: FrameOutcome) -> dict[str, Any
         else:
             entry["reprojection_px"] = _by_camera(take.rig, hand.reprojection_px)
             entry["joints_shown"] = _by_camera(take.rig, hand.joints_shown)
+            if hand.result.joint_sigma_m is not None:
+                entry["joint_sigma_mm"] = (1000 * hand.result.joint_sigma_m).astype(float).round(2).tolist()
         hands.append(entry)
     return {**report, "hands": hands}
 

@@ -6,101 +6,25 @@ wrong. An image that cannot be read, or a hand whose boxes do not fit together, 
 report says why.
 """
 
-import functools
 import logging
 import os
-import time
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from poem_jax.capture.agreement import Reasons, judge_take
-from poem_jax.capture.boxes_file import HOW_TO_GET_BOXES, align_frames, read_boxes, without_boxes_outside
 from poem_jax.capture.engine import Engine, load_engine, reconstruct_samples
-from poem_jax.capture.folder import find_frames
 from poem_jax.capture.outcome import hand_outcome
-from poem_jax.capture.outputs import (
-    PageFrames,
-    frame_report,
-    make_gallery,
-    page_frame,
-    remove_stale_meshes,
-    versions,
-    write_arrays,
-    write_frame,
-    write_json,
-)
-from poem_jax.capture.reprojection import error_summary
-from poem_jax.capture.rig_file import read_rig
+from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
 from poem_jax.capture.samples import HandResult, HandSample, empty_sample, make_sample
-from poem_jax.capture.take import FrameImages, FrameOutcome, Take, prediction_arrays, read_frame
-from poem_jax.typing import Array, UInt8
-from poem_jax.viz.page import HOW_TO_GET_THE_PAGE, PageCamera, PageFrame, page_available, write_page
+from poem_jax.capture.take import FrameImages, FrameOutcome, Take, read_frame
+from poem_jax.typing import Array
 
-RIG_FILES = ("rig.json", "calibration/rig.json")
-BOXES_FILES = ("boxes.npz",)
 MAX_BATCH = 4
 """Hands at a time: enough to keep two cores busy, little enough to wait for."""
 
 _log = logging.getLogger(__name__)
-
-
-class Written(NamedTuple):
-    """What a reconstruction gave."""
-
-    arrays: dict[str, Array]
-    """As in `prediction.npz`."""
-    report: dict[str, Any]
-    """As in `report.json`."""
-    files: list[Path]
-    """Everything that was written."""
-
-
-class _Clock:
-    """Seconds spent per activity."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = self._start = time.perf_counter()
-
-    def lap(self, activity: str) -> None:
-        """Book the time since the last lap."""
-        now = time.perf_counter()
-        self.seconds[activity] = self.seconds.get(activity, 0.0) + now - self._last
-        self._last = now
-
-    def rounded(self) -> dict[str, float]:
-        """Return everything booked, and the total."""
-        total = time.perf_counter() - self._start
-        return {name: round(value, 3) for name, value in {**self.seconds, "total": total}.items()}
-
-
-def read_take(
-    folder: str | os.PathLike, rig: str | os.PathLike | None = None, boxes: str | os.PathLike | None = None
-) -> Take:
-    """Read rig and boxes of a capture, and list its frames.
-
-    Args:
-        folder: One image per camera, or `frames/<frame>/<camera>.jpg`.
-        rig: Rig file; None = `rig.json` or `calibration/rig.json` in the folder.
-        boxes: File of boxes or key points; None = `boxes.npz` in the folder.
-
-    Raises:
-        FileNotFoundError: Folder, rig, boxes or images are missing.
-        ValueError: One of them is wrong.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no capture folder at {folder}")
-    found = read_rig(_given_or_found(rig, folder, RIG_FILES, "no rig: pass --rig FILE, or put it there"))
-    frames = find_frames(folder, found.names)
-    boxes_file = _given_or_found(boxes, folder, BOXES_FILES, HOW_TO_GET_BOXES)
-    names = tuple(frame.name for frame in frames)
-    hands = align_frames(read_boxes(boxes_file), names, found.num_views, boxes_file)
-    return Take(found, frames, without_boxes_outside(hands, found.size_wh))
 
 
 def reconstruct(
@@ -124,33 +48,14 @@ def reconstruct(
         FileNotFoundError, ValueError: The checkpoint, the rig, an image of the only frame, or all frames
             cannot be used; no hand is seen by two views; `out` is a file.
     """
-    clock = _Clock()
-    out = Path(out)
-    _check_out(out)
+    clock = Clock()
+    out = results_folder(out)
     engine = load_engine(checkpoint, batch_size(take)) if engine is None else engine
     clock.lap("load_model")
-    faces = faces_by_side(engine)
     reasons = judge_take(take, engine.config.image_hw)
-    gallery = make_gallery(take.rig, len(take.frames))
-    outcomes: list[FrameOutcome] = []
-    page_frames = PageFrames()
-    files: list[Path] = []
-    for frame, images, outcome in _stream(take, engine, reasons, clock, progress):
-        name = take.frames[frame].name
-        outcomes.append(outcome)
-        files += write_frame(out / name, take, outcome, images, faces)
-        if outcome.solved:
-            page_frames.offer(functools.partial(page_frame, take, outcome, name, images, gallery))
-        clock.lap("write")
-    _check_any(take, outcomes)
-    arrays = prediction_arrays(take, outcomes)
-    files.append(write_arrays(out / "prediction.npz", arrays))
-    files += _write_page(out / "index.html", page_frames.kept, gallery.cameras, faces)
-    clock.lap("write")
-    report = _report(take, outcomes, arrays, engine, clock)
-    files.append(write_json(out / "report.json", report))
-    remove_stale_meshes(out, take, outcomes)
-    return Written(arrays, report, files)
+    frames = _stream(take, engine, reasons, clock, progress)
+    about = {"engine": "network", "weights": engine.origin, "image_hw": list(engine.config.image_hw)}
+    return write_results(take, out, frames, faces_by_side(engine), clock, about)
 
 
 def batch_size(take: Take) -> int:
@@ -165,17 +70,10 @@ def faces_by_side(engine: Engine) -> dict[str, Array]:
     return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
 
 
-def _check_out(out: Path) -> None:
-    """Raise if a file stands where the folder for the results, or one above it, should be."""
-    existing = next((path for path in (out, *out.parents) if path.exists()), out)
-    if existing.is_file():
-        raise ValueError(f"the results go to a folder; {existing} is a file: give another --out")
-
-
 def _stream(
-    take: Take, engine: Engine, reasons: Reasons, clock: _Clock, progress: bool
-) -> Iterator[tuple[int, list[UInt8[Array, "h w 3"] | None], FrameOutcome]]:
-    """Yield every frame's index, images and outcome, in order, a batch of the model at a time."""
+    take: Take, engine: Engine, reasons: Reasons, clock: Clock, progress: bool
+) -> Iterator[FrameResults]:
+    """Yield every frame's images and outcome, in order, a batch of the model at a time."""
     group = max(1, engine.batch_size // len(take.hands.hand_side))
     several = len(take.frames) > 1
     with tqdm(total=len(take.frames), unit="frame", disable=not (progress and several)) as bar:
@@ -192,7 +90,7 @@ def _stream(
                     for hand, sample in enumerate(samples)
                 )
                 _warn(take, frame, found, reasons[frame])
-                yield frame, found.images, FrameOutcome(hands, found.problems)
+                yield FrameResults(found.images, FrameOutcome(hands, found.problems))
                 bar.update()
 
 
@@ -231,63 +129,3 @@ def _run(engine: Engine, samples: list[HandSample]) -> list[HandResult]:
     starts = range(0, len(samples), engine.batch_size)
     chunks = (samples[start : start + engine.batch_size] for start in starts)
     return [result for chunk in chunks for result in reconstruct_samples(engine, chunk)]
-
-
-def _check_any(take: Take, outcomes: list[FrameOutcome]) -> None:
-    """Raise if nothing at all came of a take: the first lost image, or why no hand was solved."""
-    if any(outcome.solved for outcome in outcomes):
-        return
-    lost = (problem.error for outcome in outcomes for problem in outcome.problems if problem.needed)
-    if (error := next(lost, None)) is not None:
-        raise error
-    views = int(np.isfinite(take.hands.boxes_px).all(-1).sum(-1).max(initial=0))
-    if views < 2:
-        raise ValueError(
-            f"no hand could be reconstructed: at least two views must see it; at most {views} of "
-            f"{take.rig.num_views} do. Add boxes for more views"
-        )
-    hands = [hand for outcome in outcomes for hand in outcome.hands]
-    best = max(hands, key=lambda hand: int(hand.view_mask.sum()))
-    raise ValueError(f"no hand could be reconstructed: {best.reason}")
-
-
-def _write_page(
-    path: Path, frames: list[PageFrame], cameras: list[PageCamera], faces: dict[str, Array]
-) -> list[Path]:
-    """Write the page if that can be done here; a warning says why not. The other results do not need it."""
-    if not page_available():
-        _log.warning(HOW_TO_GET_THE_PAGE)
-        return []
-    try:
-        return [write_page(path, frames, cameras, faces)]
-    except OSError as error:  # It takes a free port to record a page.
-        _log.warning("the 3D page cannot be written, everything else is: %s", error)
-        return []
-
-
-def _report(
-    take: Take, outcomes: list[FrameOutcome], arrays: dict[str, Array], engine: Engine, clock: _Clock
-) -> dict[str, Any]:
-    return {
-        "timings_s": clock.rounded(),
-        "reprojection": error_summary(arrays["reprojection_px"], arrays["views_used"], take.hands),
-        "weights": engine.origin,
-        "image_hw": list(engine.config.image_hw),
-        "cameras": list(take.rig.names),
-        "hands": list(take.hand_names),
-        "failed_frames": sum(bool(outcome.problems) and not outcome.solved for outcome in outcomes),
-        "frames": [frame_report(take, frame, outcome) for frame, outcome in enumerate(outcomes)],
-        "versions": versions(),
-    }
-
-
-def _given_or_found(
-    given: str | os.PathLike | None, folder: Path, candidates: tuple[str, ...], help_text: str
-) -> Path:
-    if given is not None:
-        return Path(given)
-    found = next((folder / name for name in candidates if (folder / name).is_file()), None)
-    if found is None:
-        looked = " or ".join(str(folder / name) for name in candidates)
-        raise FileNotFoundError(f"no {looked}: {help_text}")
-    return found

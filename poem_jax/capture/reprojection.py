@@ -41,7 +41,11 @@ def model_evidence(result: HandResult, sample: HandSample, rig: Rig) -> Evidence
         result: In the capture's world, its crops unflipped.
         sample: The crops before any mirroring.
         rig: The cameras.
+
+    Raises: ValueError: The result does not come from a network.
     """
+    if result.keypoints_px is None:
+        raise ValueError("the result holds no heat-map points")
     rays = normalised_from_pixels(sample.K.astype(np.float64), result.keypoints_px.astype(np.float64))
     raw = pixels_from_normalised(rig.K, distort(rays, rig.dist))
     joints = (ROOT_JOINT,) if raw.shape[-2] == 1 else tuple(range(NUM_JOINTS))

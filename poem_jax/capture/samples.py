@@ -35,11 +35,13 @@ class HandResult(NamedTuple):
     vertices_world: Float[Array, "778 3"]
     joints_world: Float[Array, "21 3"]
     root_world: Float[Array, "3"]
-    keypoints_px: Float[Array, "view joint 2"]
-    """The model's heat-map coordinates in ideal pixels of its (unflipped) crops."""
+    keypoints_px: Float[Array, "view joint 2"] | None = None
+    """A network's heat-map coordinates in ideal pixels of its (unflipped) crops."""
     pose: Float[Array, "16 3"] | None = None
     shape: Float[Array, "10"] | None = None
     translation: Float[Array, "3"] | None = None
+    joint_sigma_m: Float[Array, "21"] | None = None
+    """Standard deviation of one coordinate of each joint, where the engine knows it."""
 
 
 def make_sample(
@@ -107,8 +109,9 @@ def mirror_result(result: HandResult, crop_width: int) -> HandResult:
         mirror_points(result.vertices_world),
         mirror_points(result.joints_world),
         mirror_points(result.root_world),
-        mirror_pixels(result.keypoints_px, crop_width),
+        None if result.keypoints_px is None else mirror_pixels(result.keypoints_px, crop_width),
         None if result.pose is None else mirror_pose(result.pose),
         result.shape,
         None if result.translation is None else mirror_points(result.translation),
+        result.joint_sigma_m,
     )

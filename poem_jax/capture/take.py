@@ -1,15 +1,27 @@
 """What a take holds and what came of it, frame by frame."""
 
+import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from poem_jax.capture.boxes_file import HandBoxes
-from poem_jax.capture.folder import FramePaths, read_image
+from poem_jax.capture.boxes_file import (
+    HOW_TO_GET_BOXES,
+    HandBoxes,
+    align_frames,
+    read_boxes,
+    without_boxes_outside,
+)
+from poem_jax.capture.folder import FramePaths, find_frames, read_image
+from poem_jax.capture.rig_file import read_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
 from poem_jax.typing import Array, Bool, Float, UInt8
+
+RIG_FILES = ("rig.json", "calibration/rig.json")
+BOXES_FILES = ("boxes.npz",)
 
 
 class Take(NamedTuple):
@@ -69,6 +81,31 @@ class FrameOutcome(NamedTuple):
         return any(hand.result is not None for hand in self.hands)
 
 
+def read_take(
+    folder: str | os.PathLike, rig: str | os.PathLike | None = None, boxes: str | os.PathLike | None = None
+) -> Take:
+    """Read rig and boxes of a capture, and list its frames.
+
+    Args:
+        folder: One image per camera, or `frames/<frame>/<camera>.jpg`.
+        rig: Rig file; None = `rig.json` or `calibration/rig.json` in the folder.
+        boxes: File of boxes or key points; None = `boxes.npz` in the folder.
+
+    Raises:
+        FileNotFoundError: Folder, rig, boxes or images are missing.
+        ValueError: One of them is wrong.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no capture folder at {folder}")
+    found = read_rig(_given_or_found(rig, folder, RIG_FILES, "no rig: pass --rig FILE, or put it there"))
+    frames = find_frames(folder, found.names)
+    boxes_file = _given_or_found(boxes, folder, BOXES_FILES, HOW_TO_GET_BOXES)
+    names = tuple(frame.name for frame in frames)
+    hands = align_frames(read_boxes(boxes_file), names, found.num_views, boxes_file)
+    return Take(found, frames, without_boxes_outside(hands, found.size_wh))
+
+
 def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:
     """Return `right`, `left`, or `right_0`, `right_1` where a side comes more than once."""
     return tuple(
@@ -76,12 +113,12 @@ def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:
     )
 
 
-def read_frame(take: Take, frame: int) -> FrameImages:
+def read_frame(take: Take, frame: int, *, images_needed: bool = True) -> FrameImages:
     """Read the images of a frame, and note those that are needed but missing, and those that are damaged.
 
-    A camera without a file is no problem if it sees no hand.
+    A camera without a file is no problem if it sees no hand, or if the images are only drawn on.
     """
-    needed = np.isfinite(take.hands.boxes_px[frame]).all(-1).any(0)
+    needed = np.isfinite(take.hands.boxes_px[frame]).all(-1).any(0) & images_needed
     images: list[UInt8[Array, "h w 3"] | None] = []
     problems = []
     for view in range(take.rig.num_views):
@@ -116,8 +153,8 @@ def prediction_arrays(take: Take, outcomes: list[FrameOutcome]) -> dict[str, Arr
     Returns:
         `joints_world (F,H,21,3)`, `vertices_world (F,H,778,3)`, `root_world (F,H,3)`, `reprojection_px
         (F,H,V)`, `views_used (F,H,V)`, `valid (F,H)`, `frames (F,)`, `hand_side (H,)`, `cameras (V,)`, and
-        `pose (F,H,16,3)`, `shape (F,H,10)`, `translation (F,H,3)` where the model gives them. Metres, world
-        frame.
+        where the engine gives them `pose (F,H,16,3)`, `shape (F,H,10)`, `translation (F,H,3)` and
+        `joint_sigma_m (F,H,21)`. Metres, world frame.
     """
     counts = (len(outcomes), len(take.hands.hand_side))
     shapes = {
@@ -127,6 +164,7 @@ def prediction_arrays(take: Take, outcomes: list[FrameOutcome]) -> dict[str, Arr
         "pose": (NUM_SKELETON_JOINTS, 3),
         "shape": (NUM_SHAPES,),
         "translation": (3,),
+        "joint_sigma_m": (NUM_JOINTS,),
     }
     arrays: dict[str, Array] = {
         name: np.full((*counts, *shape), np.nan, np.float32) for name, shape in shapes.items()
@@ -143,10 +181,22 @@ def prediction_arrays(take: Take, outcomes: list[FrameOutcome]) -> dict[str, Arr
                 value: Any = None if solved.result is None else getattr(solved.result, name)
                 if value is not None:
                     arrays[name][frame, hand] = value
-    for name in ("pose", "shape", "translation"):
+    for name in ("pose", "shape", "translation", "joint_sigma_m"):
         if not np.isfinite(arrays[name]).any():
             del arrays[name]
     arrays["frames"] = np.array([frame.name for frame in take.frames])
     arrays["hand_side"] = np.array(take.hands.hand_side)
     arrays["cameras"] = np.array(take.rig.names)
     return arrays
+
+
+def _given_or_found(
+    given: str | os.PathLike | None, folder: Path, candidates: tuple[str, ...], help_text: str
+) -> Path:
+    if given is not None:
+        return Path(given)
+    found = next((folder / name for name in candidates if (folder / name).is_file()), None)
+    if found is None:
+        looked = " or ".join(str(folder / name) for name in candidates)
+        raise FileNotFoundError(f"no {looked}: {help_text}")
+    return found

@@ -127,13 +127,15 @@ def rotations_from_raw_quaternions(quaternions: Float[Array, "*batch 4"]) -> Flo
 
 
 def axis_angle_from_raw_quaternion(quaternions: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3"]:
-    """Return the shorter turn, as axis-angle, of quaternions wxyz of any length but zero."""
+    """Return axis-angle vectors of quaternions wxyz of any length but zero.
+
+    As the release: the angle is 2 atan2(|xyz|, w), so above 180 degrees where w is negative.
+    """
     w, v = quaternions[..., :1], quaternions[..., 1:]
     n2 = jnp.sum(v * v, axis=-1, keepdims=True)
     still = n2 <= 1e-24
     n = jnp.sqrt(jnp.where(still, 1, n2))
-    angle = 2 * jnp.where(w < 0, jnp.arctan2(-n, -w), jnp.arctan2(n, w))
-    return v * jnp.where(still, 2 / jnp.where(still, w, 1), angle / n)
+    return v * jnp.where(still, 2 / jnp.where(still, w, 1), 2 * jnp.arctan2(n, w) / n)
 
 
 def axis_and_angle(

@@ -213,12 +213,15 @@ def _normal_equations(
 def _refine(points: Array, uv: Array, weights: Array, K: Array, T: Array) -> Float[Array, "*batch joint 3"]:
     """Take a few Gauss-Newton steps; joints with fewer than two views stay."""
     solvable = (jnp.sum(weights > 0, axis=-2) >= _FEWEST_VIEWS)[..., None]
-    for _ in range(_STEPS):
+
+    def step(points: Array, _: None) -> tuple[Array, None]:
         H, g = _normal_equations(points, uv, weights, K, T)
         step = jnp.sum(_inverse(H, solvable) * g[..., None, :], axis=-1)
         length = jnp.linalg.norm(jnp.where(solvable, step, 1), axis=-1, keepdims=True)
-        points = points - jnp.where(solvable, step * jnp.minimum(1, 0.1 / length), 0)
-    return points
+        return points - jnp.where(solvable, step * jnp.minimum(1, 0.1 / length), 0), None
+
+    # A loop of the program: written out, XLA:CPU fuses the steps into one kernel that overflows its stack.
+    return jax.lax.scan(step, points, None, length=_STEPS)[0]
 
 
 def _inverse(H: Array, solvable: Array) -> Float[Array, "*batch joint 3 3"]:

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
-from poem_jax.fitting.anatomy import axis_angle_from_raw_quaternion
+from poem_jax.fitting.anatomy import rotations_from_raw_quaternions
 from poem_jax.fitting.keypoints import RobustPoints, projection_jacobian, triangulate_robust
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
 from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState, joint_sigma, solve
 from poem_jax.fitting.smooth import SmoothConfig, smooth
 from poem_jax.fitting.start import FEWEST_JOINTS, closed_form_pose
+from poem_jax.geometry.transforms import axis_angle_from_rotation
 from poem_jax.hand.model import HandModel, hand_mesh
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, WRIST
 from poem_jax.typing import Array, Bool, Float
@@ -58,6 +59,8 @@ class FitResult(NamedTuple):
     a view has none."""
     sigma_m: Float[Array, "frame 21"]
     """Standard deviation of one coordinate of each joint; zero where not `valid`."""
+    inlier_mask: Bool[Array, "frame view 21"]
+    """The key points that agree with each other, and were fitted."""
 
 
 def fit_take(
@@ -129,7 +132,7 @@ def fit_take_adam(
         return adam_fit(model, uv, w, K, T, begin, recipe, diagonal_px=diagonal_px)[0]
 
     found = jax.vmap(one)(take.uv_px, weights, take.K, take.T_cam_from_world, start)
-    pose = axis_angle_from_raw_quaternion(found.quaternions)
+    pose = axis_angle_from_rotation(rotations_from_raw_quaternions(found.quaternions))
     state = TakeState(pose, found.translation, found.shape)
     return _result(
         model, keypoints_px, confidence, mask, take, state, jnp.zeros((*pose.shape[:1], NUM_JOINTS))
@@ -214,4 +217,5 @@ def _result(
         valid,
         jnp.where((count > 0) & valid[:, None], mean, jnp.nan),
         jnp.where(valid[:, None], sigma, 0),
+        take.weights > 0,
     )

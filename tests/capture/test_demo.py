@@ -7,8 +7,7 @@ import pytest
 
 from poem_jax.capture.demo import demo_folder, ground_truth, mpvpe_mm
 from poem_jax.capture.lens import project_raw
-from poem_jax.capture.pipeline import read_take
-from poem_jax.capture.take import read_frame
+from poem_jax.capture.take import read_frame, read_take
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -11,9 +11,9 @@ from poem_jax.batch import Prediction
 from poem_jax.capture import outputs, pipeline
 from poem_jax.capture.boxes_file import read_boxes, write_boxes
 from poem_jax.capture.engine import Engine
-from poem_jax.capture.pipeline import batch_size, read_take, reconstruct
+from poem_jax.capture.pipeline import batch_size, reconstruct
 from poem_jax.capture.rig_file import write_rig
-from poem_jax.capture.take import hand_names
+from poem_jax.capture.take import hand_names, read_take
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand

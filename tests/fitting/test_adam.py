@@ -1,46 +1,89 @@
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.fitting.adam import ADAM_300, ADAM_300_RELEASE, AdamRecipe, adam_fit, released_start
-from poem_jax.fitting.kinematics import keypoint_model
+from poem_jax.fitting.adam import (
+    ADAM_300,
+    ADAM_300_RELEASE,
+    AdamParameters,
+    AdamRecipe,
+    adam_fit,
+    fitting_loss,
+    released_start,
+)
+from poem_jax.fitting.anatomy import axis_angle_from_raw_quaternion
+from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
 from poem_jax.fitting.solvers import fit_take_adam
 from poem_jax.hand.mano_file import load
+from poem_jax.hand.model import hand_mesh
+
+STATES = {"quaternions": "hand_pose", "shape": "hand_shape", "translation": "hand_tsl"}
+
+
+class Stored(NamedTuple):
+    """The stored run of the release, and what it was given."""
+
+    golden: dict[str, np.ndarray]
+    model: KeypointModel
+    views: tuple[np.ndarray, ...]
+
+    def state(self, step: int) -> AdamParameters:
+        """Return the parameters after `step` steps."""
+        quaternions, shape, translation = (self.golden[f"iter{step}/{name}"] for name in STATES.values())
+        return AdamParameters(quaternions.reshape(16, 4), shape.reshape(10), translation.reshape(3))
+
+
+@pytest.fixture(scope="module")
+def stored(shared_dir) -> Stored:
+    folder = shared_dir / "reference" / "poem_v1"
+    golden = dict(np.load(folder / "golden_fit.npz"))
+    keypoints = golden["keypoints"]
+    views = (keypoints[..., :2], keypoints[..., 2], golden["cam_intr"], golden["cam_extr_master_to_cam"])
+    return Stored(golden, keypoint_model(load(folder / "fake_mano.npz")), views)
 
 
 @pytest.mark.parity
-@pytest.mark.slow
-def test_the_released_recipe_follows_the_release(shared_dir):
-    """Losses to step 75 and states to step 50 within 1e-3.
+def test_the_released_recipe_follows_the_release(stored):
+    """Losses to step 70 and states to step 50 within 1e-3.
 
-    Beyond that float32 decides: our own recipe in float32 and in float64 differ by 8e-3 before step 100 and
-    by 0.1 before step 300, as accumulated gradients of norm 20 to 50, clipped to 0.1, only give directions.
+    The descent is unstable: accumulated gradients of norm 20 to 50, clipped to 0.1, only give directions. The
+    released code itself, run again in PyTorch from parameters 1e-7 off, leaves the stored losses by 1e-3 at
+    step 75 and by 1e-2 before step 100. Beyond step 70 the stored states are therefore compared one by one,
+    in the next test.
     """
-    folder = shared_dir / "reference" / "poem_v1"
-    golden = np.load(folder / "golden_fit.npz")
+    golden = stored.golden
     noise = (golden["init_pose"].reshape(16, 4) - np.array([1, 0, 0, 0])) / 0.1
-    keypoints = golden["keypoints"]
     run = jax.jit(partial(adam_fit, recipe=ADAM_300_RELEASE, trace=True))
-    _, trace = run(
-        keypoint_model(load(folder / "fake_mano.npz")),
-        keypoints[..., :2],
-        keypoints[..., 2],
-        golden["cam_intr"],
-        golden["cam_extr_master_to_cam"],
-        released_start(jnp.asarray(noise, jnp.float32)),
-    )
+    _, trace = run(stored.model, *stored.views, released_start(jnp.asarray(noise, jnp.float32)))
     assert float(trace.keypoint_loss[0]) == pytest.approx(0.14027, abs=1e-5)
     np.testing.assert_allclose(trace.keypoint_loss[:70], golden["reprojection_loss"][:70], rtol=1e-3)
-    np.testing.assert_allclose(trace.rates[:246, [0, 1, 2]], golden["lr"][:246][:, [0, 1, 2]], rtol=1e-6)
-    names = {"quaternions": "hand_pose", "shape": "hand_shape", "translation": "hand_tsl"}
+    np.testing.assert_allclose(trace.rates[:246], golden["lr"][:246], rtol=1e-6)
     for step in (1, 2, 5, 10, 20, 50):
-        for ours, theirs in names.items():
+        for ours, theirs in STATES.items():
             state = np.ravel(getattr(trace.parameters, ours)[step - 1])
             expected = np.ravel(golden[f"iter{step}/{theirs}"])
             np.testing.assert_allclose(state, expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parity
+@pytest.mark.parametrize("step", [1, 2, 5, 10, 20, 50, 100, 200])
+def test_the_loss_of_every_stored_state_is_the_releases(stored, step):
+    _, keypoints = jax.jit(fitting_loss)(stored.state(step), stored.model, *stored.views)
+    np.testing.assert_allclose(keypoints, stored.golden["reprojection_loss"][step], rtol=1e-4)
+
+
+@pytest.mark.parity
+def test_the_last_stored_state_gives_the_stored_hand(stored):
+    last = stored.state(300)
+    pose = axis_angle_from_raw_quaternion(last.quaternions)
+    translation = last.translation - rest_wrist(stored.model, last.shape)
+    mesh = hand_mesh(stored.model.hand, pose, last.shape, translation)
+    np.testing.assert_allclose(mesh.joints, stored.golden["final_joints"], atol=1e-6)
+    np.testing.assert_allclose(mesh.vertices, stored.golden["final_verts"], atol=1e-6)
 
 
 def test_the_rates_are_halved_after_the_patience(model, takes):

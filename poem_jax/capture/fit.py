@@ -1,0 +1,241 @@
+"""From 2D key points and a rig to hand meshes: the whole of `poem fit`, which needs no network and no images.
+
+Every hand is fitted to all of its frames at once (`poem_jax.fitting.solvers`), so that its shape is one. What
+is wrong with the whole take - camera matrices, unit, side, order of the joints - is said once, before
+anything is written; a frame in which a hand cannot be fitted is marked, and stops nothing.
+"""
+
+import functools
+import logging
+import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from poem_jax.capture.agreement import check_each_camera
+from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
+from poem_jax.capture.folder import FramePaths, find_frames
+from poem_jax.capture.keypoint_agreement import (
+    check_triangulation,
+    judge_fit,
+    warn_of_pairs,
+)
+from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
+from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
+from poem_jax.capture.rig_file import read_rig
+from poem_jax.capture.samples import HandResult
+from poem_jax.capture.take import FrameOutcome, HandOutcome, Take, read_frame
+from poem_jax.geometry.distortion import undistort_pixels
+from poem_jax.geometry.rig import Rig
+from poem_jax.hand.model import HandModel, mirror
+from poem_jax.hand.topology import ROOT_JOINT
+from poem_jax.typing import Array, Float
+
+if TYPE_CHECKING:
+    from poem_jax.fitting.solvers import FitConfig, FitResult
+
+NOT_FITTED = "fewer than three joints are seen by two views that agree on them"
+
+_log = logging.getLogger(__name__)
+
+
+class Hands(NamedTuple):
+    """The hand models of both sides."""
+
+    right: HandModel
+    left: HandModel
+
+    def of(self, side: str) -> HandModel:
+        """Return the model of a side."""
+        return self.left if side == "left" else self.right
+
+    def other(self, side: str) -> HandModel:
+        """Return the model of the opposite side."""
+        return self.right if side == "left" else self.left
+
+
+def hands_of(model: HandModel) -> Hands:
+    """Return a hand and its mirror image."""
+    reflected = HandModel(*(np.asarray(array) for array in mirror(model)))
+    return Hands(reflected, model) if model.side == "left" else Hands(model, reflected)
+
+
+def read_keypoint_take(
+    keypoints: str | os.PathLike, rig: str | os.PathLike, images: str | os.PathLike | None = None
+) -> Take:
+    """Read key points and rig; the frames are those of the key-point file.
+
+    Args:
+        keypoints: File of key points.
+        rig: Rig file.
+        images: Capture folder to draw on; its frames are found by name. None = no images.
+
+    Raises:
+        FileNotFoundError: A file, or every image, is missing.
+        ValueError: One of them is wrong, they have different numbers of views, or no name of a frame fits.
+    """
+    found = read_rig(rig)
+    hands = read_boxes(keypoints)
+    if hands.keypoints_px is None:
+        raise ValueError(
+            f"{keypoints} holds boxes only; a fit needs `keypoints_px (F, H, V, 21, 2)`, OpenPose order"
+        )
+    pictures = [] if images is None else find_frames(images, found.names)
+    by_key = {frame_key(frame.name): frame for frame in pictures}
+    names = hands.frames or _frame_names(len(hands.boxes_px), pictures)
+    hands = align_frames(hands, names, found.num_views, keypoints)
+    nothing = (None,) * found.num_views
+    frames = [by_key.get(frame_key(name), FramePaths(name, nothing)) for name in names]
+    if pictures and not any(frame in pictures for frame in frames):
+        raise ValueError(
+            f"{images}: no frame of it ({', '.join(frame.name for frame in pictures[:3])}) is among those of "
+            f"{keypoints} ({', '.join(names[:3])})"
+        )
+    return Take(found, frames, without_boxes_outside(hands, found.size_wh))
+
+
+def fit(
+    take: Take,
+    out: str | os.PathLike,
+    *,
+    hand: HandModel | None = None,
+    smooth: bool = False,
+    progress: bool = True,
+) -> Written:
+    """Fit every hand of a take to its key points, and write what `reconstruct` writes, under `out`.
+
+    Beyond that `prediction.npz` holds `joint_sigma_m (F,H,21)`, the standard deviation of one coordinate of
+    every joint, and `pose`, `shape` and `translation` of the hand model.
+
+    Args:
+        take: From `read_keypoint_take`, or from `read_take` where the boxes come with key points.
+        out: Folder for the results.
+        hand: The user's hand in MANO's schema, of either side; None = the shipped hand.
+        smooth: Add a second pass that holds each hand's frames together.
+        progress: Show a progress bar when there are several frames.
+
+    Raises:
+        FileNotFoundError, ValueError: No key points; fewer than two views; the rig does not fit the key
+            points, or its unit is wrong; no hand can be fitted; `out` is a file.
+    """
+    from poem_jax.hand.template import default_hand
+
+    clock = Clock()
+    out = results_folder(out)
+    _check_take(take)
+    hands = hands_of(default_hand() if hand is None else hand)
+    keypoints = ideal_keypoints(take.rig, take.hands.keypoints_px)
+    warn_of_pairs(take.rig, keypoints)
+    check_triangulation(take, keypoints)
+    clock.lap("triangulate_with_compilation")
+    config = fit_config(smooth)
+    results = [_fit_hand(take, keypoints, hands, index, config) for index in range(len(take.hand_names))]
+    clock.lap("fit_with_compilation")
+    frames = _stream(take, results, progress)
+    faces = {"right": hands.right.faces, "left": hands.left.faces}
+    about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
+    return write_results(take, out, frames, faces, clock, about)
+
+
+def fit_config(smooth: bool) -> "FitConfig":
+    """Return the settings of a fit, with the second pass or without."""
+    from poem_jax.fitting.smooth import SmoothConfig
+    from poem_jax.fitting.solvers import FitConfig
+
+    return FitConfig(smooth=SmoothConfig() if smooth else None)
+
+
+def ideal_keypoints(
+    rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]
+) -> Float[Array, "frame hand view 21 2"]:
+    """Return the key points of the undistorted images with the rig's `K`; NaN stays NaN."""
+    by_view = np.moveaxis(np.nan_to_num(keypoints_px), 2, 0)
+    flat = by_view.reshape(rig.num_views, -1, 2)
+    ideal = np.moveaxis(undistort_pixels(flat, rig.K, rig.dist).reshape(by_view.shape), 0, 2)
+    return np.where(np.isfinite(keypoints_px), ideal, np.nan)
+
+
+def _check_take(take: Take) -> None:
+    if take.hands.keypoints_px is None:
+        raise ValueError(
+            "a fit needs 2D key points; this capture has boxes only: give `keypoints_px`, or use the network"
+        )
+    if take.rig.num_views < 2:
+        raise ValueError(f"a fit needs at least two views; the rig has {take.rig.num_views}")
+    check_each_camera(take.rig)
+
+
+def _fit_hand(take: Take, keypoints: Array, hands: Hands, index: int, config: "FitConfig") -> "FitResult":
+    """Fit one hand, and say so where the other side or no hand at all would fit better."""
+    side = take.hands.hand_side[index]
+    confidence = None if take.hands.confidence is None else take.hands.confidence[:, index]
+    fitted = [
+        _run(model, keypoints[:, index], confidence, take.rig, config)
+        for model in (hands.of(side), hands.other(side))
+    ]
+    for warning in judge_fit(take, keypoints[:, index], take.hand_names[index], *fitted):
+        _log.warning("%s", warning)
+    return fitted[0]
+
+
+def _run(
+    hand: HandModel, keypoints: Array, confidence: Array | None, rig: Rig, config: "FitConfig"
+) -> "FitResult":
+    import jax
+
+    from poem_jax.fitting.kinematics import keypoint_model
+
+    arrays = (keypoints, rig.K, rig.T_cam_from_world)
+    arrays = tuple(np.asarray(array, np.float32) for array in arrays)
+    trusted = None if confidence is None else np.asarray(confidence, np.float32)
+    return jax.device_get(_program(config)(keypoint_model(hand), *arrays, trusted))
+
+
+@functools.cache
+def _program(config: "FitConfig"):
+    import jax
+
+    from poem_jax.fitting.solvers import fit_take
+
+    return jax.jit(functools.partial(fit_take, config=config))
+
+
+def _stream(take: Take, results: list["FitResult"], progress: bool) -> Iterator[FrameResults]:
+    several = len(take.frames) > 1
+    for frame in tqdm(range(len(take.frames)), unit="frame", disable=not (progress and several)):
+        found = read_frame(take, frame, images_needed=False)
+        for problem in found.problems:
+            _log.warning("frame %s: an image is left out: %s", take.frames[frame].name, problem.error)
+        outcomes = tuple(_outcome(take, frame, index, result) for index, result in enumerate(results))
+        yield FrameResults(found.images, FrameOutcome(outcomes, found.problems))
+
+
+def _outcome(take: Take, frame: int, index: int, fitted: "FitResult") -> HandOutcome:
+    used = fitted.inlier_mask[frame].any(-1)
+    if not fitted.valid[frame]:
+        nothing = np.full(take.rig.num_views, np.nan)
+        name = take.frames[frame].name
+        _log.warning("frame %s: hand '%s' is left out: %s", name, take.hand_names[index], NOT_FITTED)
+        return HandOutcome(None, used, nothing, nothing, NOT_FITTED)
+    joints = fitted.joints[frame]
+    result = HandResult(
+        valid=True,
+        vertices_world=fitted.vertices[frame],
+        joints_world=joints,
+        root_world=joints[ROOT_JOINT],
+        pose=fitted.pose[frame],
+        shape=fitted.shape[frame],
+        translation=fitted.translation[frame],
+        joint_sigma_m=fitted.sigma_m[frame],
+    )
+    errors = reprojection_error(joints, given_evidence(take.hands, frame, index), used, take.rig)
+    return HandOutcome(result, used, errors, joints_shown(joints, used, take.rig))
+
+
+def _frame_names(count: int, pictures: list[FramePaths]) -> tuple[str, ...]:
+    """Name frames that the file does not: as those of the images where these are as many, else by number."""
+    if len(pictures) == count:
+        return tuple(frame.name for frame in pictures)
+    return tuple(f"{index:04d}" for index in range(count))

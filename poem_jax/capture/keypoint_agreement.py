@@ -1,0 +1,165 @@
+"""Whether the rig of a take and its 2D key points agree, and whether they are those of the hand they claim.
+
+Two views of one point satisfy the epipolar constraint; where the key points of a pair of cameras miss it by
+far in most frames, one of the two is badly calibrated or not in time. That is a warning, for other pairs may
+serve. Triangulated points of an impossible size, or none at all, are an error: nothing right can come of
+them.
+"""
+
+import functools
+import logging
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from poem_jax.capture.take import Take
+from poem_jax.geometry.camera_checks import INVERTED
+from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.transforms import invert_rigid, skew_matrix
+from poem_jax.hand.topology import ROOT_JOINT, WRIST
+from poem_jax.typing import Array, Float
+
+if TYPE_CHECKING:
+    from poem_jax.fitting.keypoints import RobustPoints
+    from poem_jax.fitting.solvers import FitResult
+
+PALM_M = (0.04, 0.16)
+"""From the wrist to the middle knuckle, metres: no hand is outside."""
+ADULT_PALM_M = 0.093
+
+_SUSPICIOUS_SHARE = 0.006
+"""Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise."""
+_LEAST_POINTS = 21
+_FITS_BETTER = 0.7
+_FITS_NOT = 4.0
+_SEEN_SHARE = 0.5
+
+_log = logging.getLogger(__name__)
+
+
+def epipolar_distances_px(
+    rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]
+) -> Float[Array, "view view"]:
+    """Return the median distance of key points from their epipolar lines for every pair of cameras.
+
+    The first-order geometric distance |x_b^T F x_a| / |(F x_a, F^T x_b)_xy| (Hartley and Zisserman, 11.9),
+    pixels of the undistorted images; NaN on the diagonal and where a pair shares fewer than 21 key points.
+    """
+    distances = np.full((rig.num_views, rig.num_views), np.nan)
+    ones = np.ones((*keypoints_px.shape[:-1], 1))
+    points = np.moveaxis(np.concatenate([keypoints_px, ones], -1), 2, 0).reshape(rig.num_views, -1, 3)
+    for a, b in combinations(range(rig.num_views), 2):
+        T_b_from_a = rig.T_cam_from_world[b] @ invert_rigid(rig.T_cam_from_world[a])
+        essential = skew_matrix(T_b_from_a[:3, 3]) @ T_b_from_a[:3, :3]
+        F = np.linalg.inv(rig.K[b]).T @ essential @ np.linalg.inv(rig.K[a])
+        lines_b, lines_a = points[a] @ F.T, points[b] @ F
+        slope = np.sqrt((lines_a[:, :2] ** 2).sum(-1) + (lines_b[:, :2] ** 2).sum(-1))
+        found = np.abs((lines_b * points[b]).sum(-1)) / np.maximum(slope, 1e-12)
+        found = found[np.isfinite(found)]
+        if len(found) >= _LEAST_POINTS:
+            distances[a, b] = distances[b, a] = np.median(found)
+    return distances
+
+
+def warn_of_pairs(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
+    """Warn of the cameras whose key points do not fit together, by name."""
+    distances = epipolar_distances_px(rig, keypoints_px)
+    limit = _SUSPICIOUS_SHARE * np.linalg.norm(rig.size_wh, axis=-1).mean()
+    pairs = [(a, b) for a, b in combinations(range(rig.num_views), 2) if distances[a, b] > limit]
+    if not pairs:
+        return
+    named = ", ".join(
+        f"'{rig.names[a]}' and '{rig.names[b]}' {distances[a, b]:.0f} px"
+        for a, b in sorted(pairs, key=lambda pair: -distances[pair])
+    )
+    _log.warning(
+        "the key points of these cameras do not fit together: %s off each other's epipolar lines (median; "
+        "expected below %.0f px). Calibration, or frames that are not of one moment? The results are not to "
+        "be trusted to the millimetre",
+        *(named, limit),
+    )
+
+
+def check_triangulation(take: Take, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
+    """Raise if the key points cannot be triangulated, or give hands of an impossible size.
+
+    Raises:
+        ValueError: The extrinsics map camera to world; their unit is not what the rig says. The message
+            says what one unit seems to be.
+    """
+    points = _triangulated(take.rig, keypoints_px)
+    seen = np.isfinite(keypoints_px).all(-1).sum(2) >= 2
+    if seen.any() and points.valid[seen].mean() < _SEEN_SHARE:
+        inverse = take.rig._replace(T_cam_from_world=invert_rigid(take.rig.T_cam_from_world))
+        if _triangulated(inverse, keypoints_px).valid[seen].mean() > 1 - _SEEN_SHARE:
+            raise ValueError(INVERTED)
+    both = points.valid[..., WRIST] & points.valid[..., ROOT_JOINT]
+    if not both.any():
+        return
+    palm = np.linalg.norm(points.points[..., WRIST, :] - points.points[..., ROOT_JOINT, :], axis=-1)
+    length = float(np.median(palm[both]))
+    if not PALM_M[0] <= length <= PALM_M[1]:
+        raise ValueError(
+            f"the rig's lengths are not metres: the hands' palms (wrist to middle knuckle) come out as "
+            f"{length:.3g} m, expected {PALM_M[0]} to {PALM_M[1]}. If the hands are adult, one unit of the "
+            f"rig is about {1000 * ADULT_PALM_M / length:.2g} mm of what it says it is: correct `unit`, or "
+            "scale every `t`"
+        )
+
+
+def judge_fit(
+    take: Take,
+    keypoints_px: Float[Array, "frame view 21 2"],
+    name: str,
+    own: "FitResult",
+    other: "FitResult",
+) -> list[str]:
+    """Return warnings: the hand is of the other side, or its key points are in another order.
+
+    Args:
+        take: The capture.
+        keypoints_px: Of one hand, ideal pixels.
+        name: Of the hand.
+        own: The fit of the side that the file names.
+        other: The fit of the opposite side.
+    """
+    error, error_other = _median_error(own), _median_error(other)
+    if not np.isfinite([error, error_other]).all():
+        return []
+    if error_other < _FITS_BETTER * error:
+        return [
+            f"hand '{name}' seems to be of the other side: it fits the key points to {error:.1f} px, its "
+            f"mirror image to {error_other:.1f} px; check `hand_side`"
+        ]
+    noise = float(_triangulated(take.rig, keypoints_px[:, None]).sigma_px.max())
+    if error > _FITS_NOT * max(noise, 1.0) * np.sqrt(2):
+        return [
+            f"hand '{name}': the views agree with each other to {noise:.1f} px, but no hand fits the key "
+            f"points better than {error:.1f} px; check that the joints are in OpenPose order (wrist, then "
+            "thumb to little finger, each from its base to its tip)"
+        ]
+    return []
+
+
+def _median_error(fitted: "FitResult") -> float:
+    errors = np.where(fitted.inlier_mask.any(-1), fitted.reprojection_px, np.nan)
+    finite = errors[np.isfinite(errors)]
+    return float(np.median(finite)) if finite.size else np.nan
+
+
+def _triangulated(rig: Rig, keypoints_px: Array) -> "RobustPoints":
+    """Triangulate (frame, hand, view, 21, 2), the noise estimated over the frames of each hand."""
+    import jax
+
+    arrays = (keypoints_px, rig.K, rig.T_cam_from_world)
+    return jax.device_get(_program()(*(np.asarray(array, np.float32) for array in arrays)))
+
+
+@functools.cache
+def _program():
+    import jax
+
+    from poem_jax.fitting.keypoints import triangulate_robust
+
+    return jax.jit(functools.partial(triangulate_robust, take_axis=0))
