@@ -127,8 +127,8 @@ def fit(
     _check_take(take)
     hands = hands_of(default_hand() if hand is None else hand)
     keypoints = ideal_keypoints(take.rig, take.hands.keypoints_px)
-    warn_of_pairs(take.rig, keypoints)
     check_triangulation(take, keypoints)
+    warn_of_pairs(take.rig, keypoints)
     clock.lap("triangulate_with_compilation")
     config = fit_config(smooth)
     results = [_fit_hand(take, keypoints, hands, index, config) for index in range(len(take.hand_names))]
@@ -170,7 +170,8 @@ def _check_take(take: Take) -> None:
 def _fit_hand(take: Take, keypoints: Array, hands: Hands, index: int, config: "FitConfig") -> "FitResult":
     """Fit one hand, and say so where the other side or no hand at all would fit better."""
     side = take.hands.hand_side[index]
-    confidence = None if take.hands.confidence is None else take.hands.confidence[:, index]
+    confidence = take.hands.confidence
+    confidence = np.ones(keypoints[:, index].shape[:-1]) if confidence is None else confidence[:, index]
     fitted = [
         _run(model, keypoints[:, index], confidence, take.rig, config)
         for model in (hands.of(side), hands.other(side))
@@ -181,16 +182,15 @@ def _fit_hand(take: Take, keypoints: Array, hands: Hands, index: int, config: "F
 
 
 def _run(
-    hand: HandModel, keypoints: Array, confidence: Array | None, rig: Rig, config: "FitConfig"
+    hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig"
 ) -> "FitResult":
     import jax
 
     from poem_jax.fitting.kinematics import keypoint_model
 
-    arrays = (keypoints, rig.K, rig.T_cam_from_world)
+    arrays = (keypoints, rig.K, rig.T_cam_from_world, confidence)
     arrays = tuple(np.asarray(array, np.float32) for array in arrays)
-    trusted = None if confidence is None else np.asarray(confidence, np.float32)
-    return jax.device_get(_program(config)(keypoint_model(hand), *arrays, trusted))
+    return jax.device_get(_program(config)(keypoint_model(hand), *arrays))
 
 
 @functools.cache

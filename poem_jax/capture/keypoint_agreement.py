@@ -33,7 +33,9 @@ _SUSPICIOUS_SHARE = 0.006
 _LEAST_POINTS = 21
 _FITS_BETTER = 0.7
 _FITS_NOT = 4.0
-_SEEN_SHARE = 0.5
+_AGREEING = (0.75, 0.9)
+"""Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
+their inverses are right."""
 
 _log = logging.getLogger(__name__)
 
@@ -89,10 +91,9 @@ def check_triangulation(take: Take, keypoints_px: Float[Array, "frame hand view 
             says what one unit seems to be.
     """
     points = _triangulated(take.rig, keypoints_px)
-    seen = np.isfinite(keypoints_px).all(-1).sum(2) >= 2
-    if seen.any() and points.valid[seen].mean() < _SEEN_SHARE:
+    if _agreeing_share(points, keypoints_px) < _AGREEING[0]:
         inverse = take.rig._replace(T_cam_from_world=invert_rigid(take.rig.T_cam_from_world))
-        if _triangulated(inverse, keypoints_px).valid[seen].mean() > 1 - _SEEN_SHARE:
+        if _agreeing_share(_triangulated(inverse, keypoints_px), keypoints_px) > _AGREEING[1]:
             raise ValueError(INVERTED)
     both = points.valid[..., WRIST] & points.valid[..., ROOT_JOINT]
     if not both.any():
@@ -140,6 +141,13 @@ def judge_fit(
             "thumb to little finger, each from its base to its tip)"
         ]
     return []
+
+
+def _agreeing_share(points: "RobustPoints", keypoints_px: Array) -> float:
+    """Return the share of the key points, of joints that two views see, that agree with each other."""
+    seen = np.isfinite(keypoints_px).all(-1)
+    seen &= seen.sum(2, keepdims=True) >= 2
+    return float(points.inlier_mask[seen].mean()) if seen.any() else 1.0
 
 
 def _median_error(fitted: "FitResult") -> float:

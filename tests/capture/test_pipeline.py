@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import Prediction
-from poem_jax.capture import outputs, pipeline
+from poem_jax.capture import outputs, results
 from poem_jax.capture.boxes_file import read_boxes, write_boxes
 from poem_jax.capture.engine import Engine
 from poem_jax.capture.pipeline import batch_size, reconstruct
@@ -224,7 +224,7 @@ def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
 ):
     pages = []
     monkeypatch.setattr(outputs, "PAGE_FRAMES", 2)
-    monkeypatch.setattr(pipeline, "write_page", lambda path, frames, *_: pages.append(frames) or path)
+    monkeypatch.setattr(results, "write_page", lambda path, frames, *_: pages.append(frames) or path)
     capture = make_capture(7)
     capture.hands.boxes_px[::2] = np.nan
     write_boxes(capture.folder / "boxes.npz", capture.hands)
@@ -239,7 +239,7 @@ def test_a_page_that_cannot_be_recorded_costs_the_page_alone(
     def no_port(*_):
         raise OSError("no free port")
 
-    monkeypatch.setattr(pipeline, "write_page", no_port)
+    monkeypatch.setattr(results, "write_page", no_port)
     run(make_capture(), tmp_path / "out", engine)
     assert (tmp_path / "out" / "report.json").exists()
     assert "the 3D page cannot be written, everything else is: no free port" in caplog.text
@@ -392,7 +392,7 @@ def test_what_is_missing_is_said(make_capture, tmp_path):
 
 
 def test_without_viser_everything_else_is_written(make_capture, tmp_path, engine, monkeypatch, caplog):
-    monkeypatch.setattr(pipeline, "page_available", lambda: False)
+    monkeypatch.setattr(results, "page_available", lambda: False)
     written = run(make_capture(), tmp_path / "out", engine)
     assert "index.html" not in {path.name for path in written.files}
     assert "pip install 'poem-jax[viz]'" in caplog.text

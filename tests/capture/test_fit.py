@@ -1,0 +1,252 @@
+"""`poem fit`: what comes of key points, and what is said of those that cannot be right."""
+
+import json
+import logging
+
+import cv2
+import numpy as np
+import pytest
+
+from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
+from poem_jax.capture.fit import fit, hands_of, read_keypoint_take
+from poem_jax.capture.keypoint_agreement import epipolar_distances_px
+from poem_jax.capture.rig_file import write_rig
+from poem_jax.capture.take import Take
+from poem_jax.cli import main
+from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
+from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.template import default_hand
+from poem_jax.hand.topology import OPENPOSE_FROM_MANO
+from tests.fitting.conftest import make_take
+
+FRAMES, VIEWS, SIDES = 6, 4, ("right", "left")
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Both hands of a take, each with its own truth, in one rig with lenses."""
+    takes = [make_take(FRAMES, VIEWS, 0.5, 40, hand=default_hand(side)) for side in SIDES]
+    return np.stack([take.joints for take in takes], 1), np.stack([take.vertices for take in takes], 1), takes
+
+
+@pytest.fixture(scope="module")
+def take(truth) -> Take:
+    _, _, takes = truth
+    rig = Rig(
+        tuple(f"cam_{view}" for view in range(VIEWS)),
+        np.tile([1280, 720], (VIEWS, 1)),
+        takes[0].K.astype(np.float64),
+        np.zeros((VIEWS, 5)),
+        takes[0].T.astype(np.float64),
+    )
+    return with_keypoints(rig, np.stack([t.uv_px for t in takes], 1).astype(np.float64))
+
+
+def with_keypoints(rig: Rig, keypoints: np.ndarray, sides=SIDES, confidence=None) -> Take:
+    frames = tuple(f"{frame:04d}" for frame in range(len(keypoints)))
+    hands = HandBoxes(boxes_from_keypoints(keypoints), sides, frames, keypoints, confidence)
+    from poem_jax.capture.folder import FramePaths
+
+    return Take(rig, [FramePaths(name, (None,) * rig.num_views) for name in frames], hands)
+
+
+def changed(take: Take, **changes) -> Take:
+    return take._replace(hands=take.hands._replace(**changes))
+
+
+def error_mm(arrays, truth) -> np.ndarray:
+    return 1000 * np.linalg.norm(arrays["joints_world"] - truth[0], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def fitted(take, tmp_path_factory):
+    return fit(take, tmp_path_factory.mktemp("out"), progress=False)
+
+
+def test_both_hands_are_found(fitted, truth):
+    assert fitted.arrays["valid"].all()
+    assert np.median(error_mm(fitted.arrays, truth)) < 1
+    assert error_mm(fitted.arrays, truth).max() < 6
+
+
+def test_the_arrays_are_those_of_one_hand_model(fitted):
+    """Pose, shape and place give the mesh; the uncertainty is a number of millimetres."""
+    hands = hands_of(default_hand())
+    for index, side in enumerate(SIDES):
+        pose, shape, place = (fitted.arrays[n][:, index] for n in ("pose", "shape", "translation"))
+        mesh = hand_mesh(hands.of(side), pose, shape, place)
+        np.testing.assert_allclose(mesh.vertices, fitted.arrays["vertices_world"][:, index], atol=1e-5)
+        np.testing.assert_array_equal(shape, np.tile(shape[:1], (FRAMES, 1)))
+    assert (fitted.arrays["joint_sigma_m"] > 1e-5).all()
+    assert (fitted.arrays["joint_sigma_m"] < 5e-3).all()
+
+
+def test_the_report_says_what_was_done(fitted):
+    assert fitted.report["engine"] == "fit"
+    hand = fitted.report["frames"][0]["hands"][1]
+    assert hand["hand"] == "left"
+    assert len(hand["joint_sigma_mm"]) == 21
+    assert fitted.report["reprojection"]["median_px"] < 2
+
+
+def test_one_bad_frame_is_marked(take, fitted, tmp_path, truth):
+    keypoints = take.hands.keypoints_px.copy()
+    keypoints[2, 0] = np.nan
+    written = fit(changed(take, keypoints_px=keypoints), tmp_path, progress=False)
+    lost = written.report["frames"][2]["hands"][0]
+    assert not lost["valid"]
+    assert "two views" in lost["reason"]
+    assert np.isnan(written.arrays["joints_world"][2, 0]).all()
+    assert written.arrays["valid"].sum() == 2 * FRAMES - 1
+    assert np.nanmedian(error_mm(written.arrays, truth)) < 1.1
+
+
+def test_nan_confidence_counts_as_unseen(take, tmp_path):
+    """A key point with NaN confidence may be anywhere."""
+    confidence = np.ones(take.hands.keypoints_px.shape[:-1])
+    confidence[:, :, 1, 8] = np.nan
+    moved = take.hands.keypoints_px.copy()
+    moved[:, :, 1, 8] += 15.0
+    one, other = (
+        fit(changed(take, keypoints_px=k, confidence=confidence), tmp_path / name, progress=False).arrays
+        for name, k in (("a", take.hands.keypoints_px), ("b", moved))
+    )
+    np.testing.assert_allclose(one["joints_world"], other["joints_world"], atol=1e-6)
+
+
+def test_millimetres_called_metres_are_refused(take, tmp_path):
+    T = take.rig.T_cam_from_world.copy()
+    T[:, :3, 3] *= 1000
+    with pytest.raises(ValueError, match=r"not metres.*one unit .* about 1(\.\d)? mm"):
+        fit(take._replace(rig=take.rig._replace(T_cam_from_world=T)), tmp_path, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_inverse_extrinsics_are_refused(take, tmp_path):
+    wrong = take.rig._replace(T_cam_from_world=invert_rigid(take.rig.T_cam_from_world))
+    with pytest.raises(ValueError, match="inverse"):
+        fit(take._replace(rig=wrong), tmp_path, progress=False)
+
+
+def test_nothing_seen_by_two_views_is_an_error(take, tmp_path):
+    keypoints = take.hands.keypoints_px.copy()
+    keypoints[:, :, 1:] = np.nan
+    lonely = changed(take, keypoints_px=keypoints, boxes_px=boxes_from_keypoints(keypoints))
+    with pytest.raises(ValueError, match="at least two views"):
+        fit(lonely, tmp_path, progress=False)
+
+
+def test_boxes_alone_are_not_enough(take, tmp_path):
+    with pytest.raises(ValueError, match="boxes only"):
+        fit(changed(take, keypoints_px=None), tmp_path, progress=False)
+
+
+def test_one_camera_is_not_enough(take, tmp_path):
+    lonely = changed(take, keypoints_px=take.hands.keypoints_px[:, :, :1])
+    with pytest.raises(ValueError, match="at least two views; the rig has 1"):
+        fit(lonely._replace(rig=take.rig.select(["cam_0"])), tmp_path, progress=False)
+
+
+def test_a_turned_camera_is_named(take, tmp_path, caplog):
+    T = take.rig.T_cam_from_world.copy()
+    T[2, :3] = rotation_from_axis_angle(np.array([0.05, 0.05, 0.0])) @ T[2, :3]
+    with caplog.at_level(logging.WARNING):
+        written = fit(take._replace(rig=take.rig._replace(T_cam_from_world=T)), tmp_path, progress=False)
+    (said,) = [r.getMessage() for r in caplog.records if "do not fit together" in r.getMessage()]
+    assert said.count("'cam_2'") >= 2
+    others = ["'cam_0' and 'cam_1'", "'cam_0' and 'cam_3'", "'cam_1' and 'cam_3'"]
+    assert not any(pair in said for pair in others)
+    assert written.arrays["valid"].all()
+
+
+def test_a_right_rig_is_not_complained_about(take, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        fit(take, tmp_path, progress=False)
+    assert not caplog.records
+
+
+def test_epipolar_distances_are_the_noise(take):
+    distances = epipolar_distances_px(take.rig, take.hands.keypoints_px)
+    off_diagonal = ~np.eye(VIEWS, dtype=bool)
+    assert np.isnan(np.diag(distances)).all()
+    # The median of |N(0, 0.5 px)|.
+    np.testing.assert_allclose(distances[off_diagonal], 0.6745 * 0.5, atol=0.1)
+
+
+def test_the_wrong_side_is_noticed(take, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        fit(changed(take, hand_side=SIDES[::-1]), tmp_path, progress=False)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    assert all("other side" in text and "hand_side" in text for text in said)
+
+
+def test_the_wrong_order_of_joints_is_noticed(take, tmp_path, caplog):
+    mano_order = np.argsort(OPENPOSE_FROM_MANO)
+    keypoints = take.hands.keypoints_px[..., mano_order, :]
+    with caplog.at_level(logging.WARNING):
+        fit(changed(take, keypoints_px=keypoints), tmp_path, progress=False)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    assert all("OpenPose order" in text for text in said)
+
+
+@pytest.fixture
+def files(take, tmp_path):
+    """The take as files, with images, one of them damaged; frame 2 has none."""
+    keypoints = write_boxes(tmp_path / "keypoints.npz", take.hands)
+    rig = write_rig(tmp_path / "rig.json", take.rig)
+    for frame in take.hands.frames:
+        folder = tmp_path / "capture" / "frames" / frame
+        folder.mkdir(parents=True)
+        for name in take.rig.names if frame != "0002" else ():
+            cv2.imwrite(str(folder / f"{name}.jpg"), np.full((720, 1280, 3), 90, np.uint8))
+    (tmp_path / "capture" / "frames" / "0003" / "cam_1.jpg").write_bytes(b"\xff\xd8")
+    return keypoints, rig, tmp_path / "capture"
+
+
+def test_the_command_writes_what_reconstruct_writes(files, fitted, tmp_path, capsys):
+    keypoints, rig, images = files
+    out = tmp_path / "out"
+    assert main(["fit", str(keypoints), "--rig", str(rig), "--out", str(out), "--images", str(images)]) == 0
+    assert "12 of 12 hands in 6 frames" in capsys.readouterr().out
+    arrays = np.load(out / "prediction.npz")
+    np.testing.assert_allclose(arrays["joints_world"], fitted.arrays["joints_world"], atol=1e-4)
+    report = json.loads((out / "report.json").read_text())
+    assert "cam_1.jpg" in report["frames"][3]["image_problems"][0]
+    overlays = sorted(path.relative_to(out).as_posix() for path in out.glob("*/overlay_*.png"))
+    assert len(overlays) == (FRAMES - 1) * VIEWS - 1
+    assert (out / "0005" / "left.glb").is_file()
+    drawn = cv2.imread(str(out / "0001" / "overlay_cam_0.png"))
+    assert (drawn != 90).any()
+
+
+def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
+    keypoints, rig, images = files
+    arguments = ["reconstruct", str(images), "--rig", str(rig), "--boxes", str(keypoints), "--out"]
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "fit"]) == 0
+    assert "12 of 12 hands in 6 frames" in capsys.readouterr().out
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", "--checkpoint", "ckpt"]) == 2
+    assert "a fit has no weights" in capsys.readouterr().err
+
+
+def test_key_points_and_rig_of_different_views_are_refused(files, take, tmp_path):
+    keypoints, _, _ = files
+    rig = write_rig(tmp_path / "three.json", take.rig.select(["cam_0", "cam_1", "cam_2"]))
+    with pytest.raises(ValueError, match="the rig has 3 views"):
+        read_keypoint_take(keypoints, rig)
+
+
+def test_images_of_other_frames_are_refused(files, tmp_path):
+    keypoints, rig, images = files
+    for frame in ("0000", "0001", "0002", "0003", "0004", "0005"):
+        (images / "frames" / frame).rename(images / "frames" / f"take2_{frame}")
+    with pytest.raises(ValueError, match="no frame of it"):
+        read_keypoint_take(keypoints, rig, images)
+
+
+def test_a_left_model_serves_right_hands():
+    hands = hands_of(default_hand("left"))
+    assert (hands.right.side, hands.left.side) == ("right", "left")
+    np.testing.assert_allclose(hands.right.v_template, default_hand().v_template, atol=1e-7)
