@@ -35,7 +35,7 @@ test-browser: setup
 	$(BIN)/python -m pytest -m browser
 
 test-parity: setup
-	$(PYTEST) -m "parity and not slow"
+	$(PYTEST) -m parity --dist loadfile
 
 test-slow: setup
 	$(PYTEST) -m slow

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.neighbours import gather
@@ -90,7 +91,9 @@ def plain_forward(
     Returns: the result, and the index sets that were used.
     """
     frame = enter_primary_frame(Cameras(cams.K, cams.T_cam_from_world), root)
-    levels = plain_trunk(params, normalised(images, config), config)
+    levels = plain_trunk(
+        params, normalised(images, config, params["constants"]["basis_points"].dtype), config
+    )
     keypoints_px, heat_maps = (_by_view(x, images) for x in plain_heat_maps(params, levels, config))
     maps = _by_view(plain_features(params, levels, config), images)
     joints, solved = _triangulated(keypoints_px, heat_maps, frame.cams, config)
@@ -108,10 +111,12 @@ def plain_forward(
     return PlainResult(layers_world, keypoints_px, heat_maps, root_world), found
 
 
-def normalised(images: Num[Array, "batch view h w 3"], config: Config) -> Float[Array, "image h w 3"]:
+def normalised(
+    images: Num[Array, "batch view h w 3"], config: Config, dtype: DTypeLike
+) -> Float[Array, "image h w 3"]:
     """Return all images in a row, as the trunk takes them."""
     scale = 255.0 if images.dtype == jnp.uint8 else 1.0
-    flat = images.reshape(-1, *images.shape[2:]).astype(jnp.float32)
+    flat = images.reshape(-1, *images.shape[2:]).astype(dtype)
     return (flat / scale - config.image_mean) / config.image_std
 
 
@@ -272,8 +277,8 @@ def plain_sampling_and_aggregation(
         maps = maps + _view_row_column_code(w["features"]["position"]["mix"], maps.shape)
     points = root[:, None] + params["constants"]["basis_points"]
     uv_px, depth = project(cams.K, cams.T_cam_from_world, points[:, None])
-    share = uv_px / jnp.array(config.image_hw[::-1], jnp.float32)
-    sampled = sample_bilinear(maps, share * jnp.array(maps.shape[-3:-1][::-1], jnp.float32))
+    share = uv_px / jnp.array(config.image_hw[::-1], uv_px.dtype)
+    sampled = sample_bilinear(maps, share * jnp.array(maps.shape[-3:-1][::-1], uv_px.dtype))
     if config.basis.behind_camera is BehindCamera.ZEROS:
         seen = (depth > 0)[..., None]
         sampled, share = jnp.where(seen, sampled, 0), jnp.where(seen, share, 0)

@@ -120,6 +120,37 @@ class Fit:
 
 
 @dataclass(frozen=True)
+class Detect:
+    """Find both hands in the images of a capture with MediaPipe and write their 2D key points."""
+
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """The capture, as for `reconstruct`."""
+    out: _File
+    """The key-point file (npz) to write, for `fit` or for `reconstruct --boxes`."""
+    rig: _Optional = None
+    """Calibration; without it rig.json or calibration/rig.json in DIR."""
+    debug: _Flag = False
+    """Show the full traceback of an error."""
+
+    def run(self) -> None:
+        """Write the file and print what was found."""
+        import numpy as np
+
+        from poem_jax.capture.boxes_file import write_boxes
+        from poem_jax.capture.detect import detect_hands
+        from poem_jax.capture.folder import find_frames
+        from poem_jax.capture.take import find_rig
+
+        rig = find_rig(self.folder, self.rig)
+        hands = detect_hands(find_frames(self.folder, rig.names), rig)
+        write_boxes(self.out, hands)
+        views = np.isfinite(hands.boxes_px).all(-1).sum(2)
+        for side, count in zip(hands.hand_side, views.T, strict=True):
+            print(f"{side} hand: seen by two views or more in {(count > 1).sum()} of {len(count)} frames")
+        print(f"written to {self.out}")
+
+
+@dataclass(frozen=True)
 class ImportTorch:
     """Turn weights that POEM's authors released into a model folder; see docs/weights.md.
 
@@ -185,7 +216,7 @@ class ExportTorch:
         print(f"torch.load({str(self.out)!r}, weights_only=True)")
 
 
-Command = Demo | Reconstruct | Fit | ImportTorch | ExportTorch
+Command = Demo | Reconstruct | Fit | Detect | ImportTorch | ExportTorch
 
 
 def start() -> int:
@@ -218,6 +249,7 @@ def _parse(arguments: Sequence[str] | None) -> Command:
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
+        | Annotated[Detect, tyro.conf.subcommand("detect")]
         | Annotated[ImportTorch, tyro.conf.subcommand("import-torch")]
         | Annotated[ExportTorch, tyro.conf.subcommand("export-torch")]
     )

@@ -181,9 +181,7 @@ def _fit_hand(take: Take, keypoints: Array, hands: Hands, index: int, config: "F
     return fitted[0]
 
 
-def _run(
-    hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig"
-) -> "FitResult":
+def _run(hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig") -> "FitResult":
     import jax
 
     from poem_jax.fitting.kinematics import keypoint_model

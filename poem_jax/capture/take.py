@@ -98,12 +98,21 @@ def read_take(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no capture folder at {folder}")
-    found = read_rig(_given_or_found(rig, folder, RIG_FILES, "no rig: pass --rig FILE, or put it there"))
+    found = find_rig(folder, rig)
     frames = find_frames(folder, found.names)
     boxes_file = _given_or_found(boxes, folder, BOXES_FILES, HOW_TO_GET_BOXES)
     names = tuple(frame.name for frame in frames)
     hands = align_frames(read_boxes(boxes_file), names, found.num_views, boxes_file)
     return Take(found, frames, without_boxes_outside(hands, found.size_wh))
+
+
+def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) -> Rig:
+    """Read the rig of a capture: the given file, else `rig.json` or `calibration/rig.json` in the folder.
+
+    Raises: FileNotFoundError, ValueError: as `read_rig`.
+    """
+    hint = "no rig: pass --rig FILE, or put it there"
+    return read_rig(_given_or_found(rig, Path(folder), RIG_FILES, hint))
 
 
 def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:

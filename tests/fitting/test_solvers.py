@@ -20,8 +20,9 @@ MODES = {mode: FitConfig(lm=LMConfig(shape_mode=mode)) for mode in ShapeMode}
 fit = jax.jit(fit_take, static_argnames="config")
 
 
-def shared(model, take, **arguments):
-    return fit(model, take.uv_px, take.K, take.T, config=MODES[ShapeMode.SHARED], **arguments)
+def shared(model, take, mask=None):
+    mask = np.ones(take.uv_px.shape[:-1], bool) if mask is None else mask
+    return fit(model, take.uv_px, take.K, take.T, mask=mask, config=MODES[ShapeMode.SHARED])
 
 
 def error_mm(result, take, what="joints"):
@@ -41,7 +42,7 @@ def test_the_start_turns_the_bones(model, takes):
     assert float(jnp.abs(again - joints).max()) < 1e-3
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.slow)])
 def test_planted_parameters_are_recovered(takes, side):
     hand = default_hand(side)
     take = takes(FRAMES, 4, 0.0, 11, hand=hand)
@@ -153,7 +154,6 @@ def test_bad_input_raises(model, takes):
 
 
 @pytest.mark.parity
-@pytest.mark.slow
 def test_released_key_points(shared_dir):
     """The stand-in hand bends any way: limits and prior of human joints say nothing about it."""
     folder = shared_dir / "reference" / "poem_v1"

@@ -87,10 +87,11 @@ def _like_tiny(micro):
 def compare(plain_form, make_params, make_scene, monkeypatch):
     """Return the largest distances (metres) of `apply` and `infer` from the plain form."""
 
-    def compare(config, views=VIEWS, seed=0) -> list[float]:
+    def compare(config, views=VIEWS, seed=0, dtype=np.float32) -> list[float]:
         params = _complete(_damped(make_params(config)), config)
         images, cams = make_scene(1, views, seed, config.image_hw)
         root = np.full((1, 3), 0.01, np.float32)
+        params, cams, root = (_cast(tree, dtype) for tree in (params, cams, root))
         expected, found = _plain(plain_form, config)(params, images, cams, root=root)
         assert np.isfinite(expected.layers).all()
         _hand_back(monkeypatch, found)
@@ -107,6 +108,11 @@ def compare(plain_form, make_params, make_scene, monkeypatch):
 
     yield compare
     _forget_programs()
+
+
+def _cast(tree, dtype):
+    arrays = jax.tree.map(np.asarray, tree)
+    return jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, arrays)
 
 
 def _plain(plain_form, config):
@@ -159,7 +165,9 @@ def test_release_parametric_of_one_view(compare, micro_config):
 
 
 def test_tiny(compare, micro_config):
-    assert max(compare(_like_tiny(micro_config))) < 1e-5
+    """In float64: its queries start at triangulated joints, which random heat maps determine badly."""
+    with jax.enable_x64(True):
+        assert max(compare(_like_tiny(micro_config), dtype=np.float64)) < 1e-7
 
 
 def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_scene):
@@ -174,7 +182,6 @@ def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_sce
 
 
 @pytest.mark.parity
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "largest"),
     [("v2-base", 1e-5), ("v2-medium-release", 1e-5), ("v2-medium-mano-release", 1e-4)],

@@ -70,6 +70,7 @@ def uneven(batch):
     return batch._replace(cameras=Cameras(K, T, mask), sample_mask=sample_mask)
 
 
+@pytest.mark.slow
 def test_overfits_one_batch(micro_params, config, batch_at):
     """Roots off centre: without any image the mean pose lowers the loss, but no key point is found.
 

@@ -49,7 +49,7 @@ from tests.weights.ties import (
     resolve,
 )
 
-pytestmark = [needs_reference, pytest.mark.slow]
+pytestmark = [needs_reference, pytest.mark.parity]
 
 
 class Case(NamedTuple):
@@ -71,15 +71,9 @@ CASES = [
     for model, names in {"small": "DABC", "medium": "ABC", "large": "AC", "medium_MANO": "ABC"}.items()
     for name in names
 ]
-FAST = Case("small", "D")
-"""The end-to-end case of the default suite."""
 KEYPOINT_PX, REFERENCE_JOINT_M, FIRST_BLOCK_M = 1e-3, 1e-5, 1e-5
 MANY, MANY_UNDER_MESH = 0.98, 0.7
 """Shares of points that agree if several ties end otherwise; one moves a whole mesh, if only by 0.1 mm."""
-
-
-def parity(case: Case) -> list[pytest.MarkDecorator]:
-    return [] if case == FAST else [pytest.mark.parity]
 
 
 def close(ours: np.ndarray, theirs: np.ndarray, atol: float) -> None:
@@ -223,20 +217,18 @@ COMPARED = [(case, key, check) for case in CASES for key, check in output_checks
 
 @pytest.mark.parametrize(
     ("case", "key", "check"),
-    [pytest.param(*row, marks=parity(row[0]), id=f"{row[0]}-{row[1]}") for row in COMPARED],
+    [pytest.param(*row, id=f"{row[0]}-{row[1]}") for row in COMPARED],
 )
 def test_outputs(case: Case, key: str, check: Callable[[Case, str], None]) -> None:
     check(case, key)
 
 
-@pytest.mark.parity
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_what_is_resolved_are_ties(case: Case) -> None:
     if final(case) is not predicted(case):
         assert_only_ties(resolved(case))
 
 
-@pytest.mark.parity
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_share_of_points_before_ties_are_resolved(case: Case) -> None:
     many = MANY_UNDER_MESH if case.model == PARAMETRIC else MANY
@@ -286,7 +278,6 @@ def assert_same(ours: Prediction, other: Prediction) -> None:
         assert gap.max() <= FARTHEST_M
 
 
-@pytest.mark.parity
 @pytest.mark.parametrize("where", PLACES)
 def test_masked_views_change_nothing(where: str) -> None:
     alone, masked = predicted(Case("small", "A")), masked_runs()[0][where]
@@ -295,13 +286,11 @@ def test_masked_views_change_nothing(where: str) -> None:
     assert_same(masked, alone)
 
 
-@pytest.mark.parity
 def test_new_masks_compile_nothing() -> None:
     first, second = masked_runs()[1]
     assert second == first
 
 
-@pytest.mark.parity
 def test_batch_of_mixed_view_counts_equals_each_sample_alone() -> None:
     """8, 5, 3 views and 1; the root is given for the single view, for which the release has none in a mix."""
     config, params = released("small")

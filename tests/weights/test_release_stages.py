@@ -20,7 +20,7 @@ from tests.weights.halves import look, reconstruct
 from tests.weights.procedural import IMAGE_HW, batch_of, golden, needs_reference, released, weight
 from tests.weights.ties import PARAMETRIC
 
-pytestmark = [needs_reference, pytest.mark.parity, pytest.mark.slow]
+pytestmark = [needs_reference, pytest.mark.parity]
 
 RECORDED = ("small", "medium", "medium_MANO")
 """Models whose intermediates are stored, all of case A."""

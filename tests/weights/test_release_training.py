@@ -3,9 +3,12 @@
 All noise is off: the root is the true joint 9 and nothing is dropped. `eval_modules` normalises by the
 running statistics, `train_modules` by those of the batch.
 
-Batch statistics make float32 worse: our own float32 and float64 runs then differ by 5e-5 m in block 0 (else
-1e-6 m) and in a quarter of the final points by more than 2e-5 m, for many neighbours change. The stored
-float32 run is as far from our float64 run, so that its 3D losses and gradients are compared to some percent.
+With running statistics our run is in float64, its neighbours those of the stored run: in float32 single
+gradients at the image end of the trunk differ by half a percent of their norm, by as much between programs
+of our own. Batch statistics make float32 worse: our own float32 and float64 runs then differ by 5e-5 m in
+block 0 (else 1e-6 m) and in a quarter of the final points by more than 2e-5 m, for many neighbours change.
+The stored float32 run is as far from our float64 run, so that its 3D losses and gradients are compared to
+some percent.
 """
 
 import functools
@@ -42,7 +45,7 @@ from tests.weights.procedural import (
 )
 from tests.weights.ties import Rerun, Run, assert_only_ties, assert_points_agree, limit_m, resolve
 
-pytestmark = [needs_reference, pytest.mark.parity, pytest.mark.slow]
+pytestmark = [needs_reference, pytest.mark.parity]
 
 FILE = "train_small_G"
 LOSS_TERMS = {
@@ -81,14 +84,16 @@ def resolved() -> Run:
 
 @functools.cache
 def step(train: bool) -> Step:
-    """Run one setting; with running statistics the neighbours are those of `resolved`."""
+    """Run one setting; with running statistics in float64, and the neighbours are those of `resolved`."""
     config, params = released("small")
     batch = in_float32(batch_of("G"))
-    with pytest.MonkeyPatch.context() as patch:
+    neighbours = () if train else resolved().index
+    with pytest.MonkeyPatch.context() as patch, jax.enable_x64(not train):
         # In a loop, the gradients of convolutions are very slow on a CPU.
         patch.setattr(Stack, "__call__", Stack.unrolled)
         if not train:
-            searches = iter(resolved().index)
+            params, batch = (jax.tree.map(in_float64, tree) for tree in (params, batch_of("G")))
+            searches = iter(neighbours)
             patch.setattr(vector_attention, "nearest", lambda queries, points, k: next(searches))
         run = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames=("config", "train"))
         (total, aux), gradients = run(params["trainable"], params, batch, config=config, train=train)
@@ -100,6 +105,10 @@ def step(train: bool) -> Step:
         for group in ("trainable", "statistics")
     }
     return Step(named_losses(float(total), terms), prediction, groups["trainable"], groups["statistics"])
+
+
+def in_float64(array: Array) -> Array:
+    return np.asarray(array, np.float64) if np.asarray(array).dtype.kind == "f" else array
 
 
 def loss(
@@ -183,13 +192,13 @@ def total_norm(gradients: dict[str, Array]) -> float:
 def check_gradient(key: str) -> None:
     """Compare a gradient in full, or, where it is large, every 8th row of (out, rest).
 
-    The difference has 2e-3 of the gradient's norm at the image end of the trunk, elsewhere some 1e-4.
+    The difference has 1.5e-3 of the gradient's norm at the image end of the trunk, elsewhere 1e-4 or less.
     """
     gradient, theirs = step(train=False).gradients[key.removeprefix("grad/")], stored()[key]
     if gradient.size >= 4000:
         gradient = gradient.reshape(len(gradient), -1)[::8]
     assert gradient.shape == theirs.shape
-    assert np.linalg.norm(gradient - theirs) <= 4e-3 * np.linalg.norm(theirs)
+    assert np.linalg.norm(gradient - theirs) <= 2e-3 * np.linalg.norm(theirs)
 
 
 def check_points(key: str) -> None:

@@ -406,7 +406,6 @@ def changes(model: str, names: list[str]) -> dict[str, float]:
 
 @needs
 @pytest.mark.parity
-@pytest.mark.slow
 @pytest.mark.parametrize("model", ["small", "medium_MANO"])
 def test_used_arrays_move_the_points_and_those_without_effect_do_not(model: str) -> None:
     names = sampled_names() if model == "small" else list(PARAMETRIC_ONLY)

@@ -1,0 +1,117 @@
+"""2D key points of both hands from images, by MediaPipe Hands: the paper's detector for real captures.
+
+MediaPipe is an extra (`pip install 'poem-jax[detect]'`), imported only here; 0.10.14 carries its models.
+Every image is looked at by itself (static mode, the full model, at most two hands). MediaPipe names sides as
+if images were mirrored, as those of a selfie camera are; ours are not, so left and right change places.
+"""
+
+import importlib.util
+import logging
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
+from poem_jax.capture.folder import FramePaths, read_image
+from poem_jax.geometry.rig import Rig
+from poem_jax.hand.topology import NUM_JOINTS
+from poem_jax.typing import Array, Float, UInt8
+
+HOW_TO_GET_DETECTION = "finding hands in images needs MediaPipe: pip install 'poem-jax[detect]'"
+SIDES = ("right", "left")
+MIN_DETECTION_CONFIDENCE = 0.5
+
+_SIDE_OF_LABEL = {"Left": "right", "Right": "left"}
+_FULL_MODEL = 1
+
+_log = logging.getLogger(__name__)
+
+
+class Detection(NamedTuple):
+    """One hand that a detector found in one image."""
+
+    side: str
+    score: float
+    """How sure the detector is of the side."""
+    keypoints_px: Float[Array, "21 2"]
+    """OpenPose order, pixels of the image, which spans [0, W] x [0, H]."""
+
+
+def detect_hands(
+    frames: Sequence[FramePaths],
+    rig: Rig,
+    *,
+    detector: Callable[[UInt8[Array, "h w 3"]], Sequence[Detection]] | None = None,
+    progress: bool = True,
+) -> HandBoxes:
+    """Find one right and one left hand in every image of a capture.
+
+    Args:
+        frames: From `find_frames`; images that are missing or damaged see nothing (a warning names them).
+        rig: The cameras.
+        detector: Finds the hands of an RGB image; None = MediaPipe.
+        progress: Show a progress bar when there are several frames.
+
+    Returns: key points (frame, 2, view, 21, 2) in the raw images, right hand first; NaN = not found.
+
+    Raises:
+        ModuleNotFoundError: MediaPipe is not installed.
+        ValueError: No hand was found at all.
+    """
+    detector = _mediapipe_detector() if detector is None else detector
+    keypoints = np.full((len(frames), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
+    for frame, paths in enumerate(tqdm(frames, unit="frame", disable=not progress or len(frames) == 1)):
+        for view, path in enumerate(paths.images):
+            if path is None:
+                continue
+            try:
+                image = read_image(path, (int(rig.size_wh[view][0]), int(rig.size_wh[view][1])))
+            except (FileNotFoundError, ValueError) as error:
+                _log.warning("frame %s: an image is left out: %s", paths.name, error)
+                continue
+            for side, found in one_of_each_side(detector(image)).items():
+                keypoints[frame, SIDES.index(side), view] = found.keypoints_px
+    if np.isnan(keypoints).all():
+        raise ValueError(
+            f"no hand was found in any image of {len(frames)} frames; give boxes or key points instead"
+        )
+    return HandBoxes(boxes_from_keypoints(keypoints), SIDES, tuple(f.name for f in frames), keypoints)
+
+
+def one_of_each_side(detections: Sequence[Detection]) -> dict[str, Detection]:
+    """Return at most one detection per side; of two that claim one side, the less sure is the other."""
+    ranked = sorted(detections, key=lambda found: -found.score)[: len(SIDES)]
+    if len(ranked) == 2 and ranked[0].side == ranked[1].side:
+        (other,) = (side for side in SIDES if side != ranked[0].side)
+        ranked[1] = ranked[1]._replace(side=other)
+    return {found.side: found for found in ranked}
+
+
+def _mediapipe_detector() -> Callable[[UInt8[Array, "h w 3"]], Sequence[Detection]]:
+    if importlib.util.find_spec("mediapipe") is None:
+        raise ModuleNotFoundError(HOW_TO_GET_DETECTION)
+    import mediapipe
+
+    hands = mediapipe.solutions.hands.Hands(
+        static_image_mode=True,
+        max_num_hands=len(SIDES),
+        model_complexity=_FULL_MODEL,
+        min_detection_confidence=MIN_DETECTION_CONFIDENCE,
+    )
+
+    def detect(image: UInt8[Array, "h w 3"]) -> list[Detection]:
+        height, width = image.shape[:2]
+        found = hands.process(np.ascontiguousarray(image))
+        pairs = zip(found.multi_hand_landmarks or (), found.multi_handedness or (), strict=True)
+        return [
+            Detection(
+                _SIDE_OF_LABEL[sides.classification[0].label],
+                sides.classification[0].score,
+                np.array([[point.x * width, point.y * height] for point in hand.landmark]),
+            )
+            for hand, sides in pairs
+        ]
+
+    return detect
