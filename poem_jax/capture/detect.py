@@ -5,6 +5,7 @@ Every image is looked at by itself (static mode, the full model, at most two han
 if images were mirrored, as those of a selfie camera are; ours are not, so left and right change places.
 """
 
+import importlib
 import importlib.util
 import logging
 from collections.abc import Callable, Sequence
@@ -92,9 +93,8 @@ def one_of_each_side(detections: Sequence[Detection]) -> dict[str, Detection]:
 def _mediapipe_detector() -> Callable[[UInt8[Array, "h w 3"]], Sequence[Detection]]:
     if importlib.util.find_spec("mediapipe") is None:
         raise ModuleNotFoundError(HOW_TO_GET_DETECTION)
-    import mediapipe
-
-    hands = mediapipe.solutions.hands.Hands(
+    # By name: type checkers run where the extra is not installed.
+    hands = importlib.import_module("mediapipe").solutions.hands.Hands(
         static_image_mode=True,
         max_num_hands=len(SIDES),
         model_complexity=_FULL_MODEL,

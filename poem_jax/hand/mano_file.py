@@ -2,7 +2,8 @@
 
 The pickles were written by Python 2 and hold chumpy variables and a scipy sparse matrix. Neither library is
 needed, nor is the pickle trusted: `io/safe_pickle.py` keeps their state in inert stand-ins, and the arrays
-are taken out here. MANO's mean pose is not used: as in the released models, zero pose means the flat hand.
+are taken out here. MANO's mean pose is not used in the hand: as in the released models, zero pose means the
+flat hand; `load_pose_space` reads it for conversions.
 """
 
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from poem_jax.hand.conventions import FINGER_NUMBERS, PoseSpace
 from poem_jax.hand.mano_values import as_array
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import (
@@ -31,6 +33,10 @@ _SHAPES = {
     "weights": (NUM_VERTICES, NUM_SKELETON_JOINTS),
     "f": (NUM_FACES, 3),
 }
+_POSE_SPACE_SHAPES = {
+    "hands_mean": (FINGER_NUMBERS,),
+    "hands_components": (FINGER_NUMBERS, FINGER_NUMBERS),
+}
 _SUM_TOLERANCE = 1e-3
 _LONGEST_HAND_M = 1.0
 
@@ -46,21 +52,35 @@ def load(path: str | Path, side: str | None = None) -> HandModel:
         FileNotFoundError: there is no such file.
         ValueError: another kind of file, a damaged or hostile one, a missing field, a wrong shape or value.
     """
-    path = Path(path)
     if side not in (None, "right", "left"):
         raise ValueError(f'`side` must be "right", "left" or None; got {side!r}')
+    return _hand_model(_read(Path(path)), str(path), side)
+
+
+def load_pose_space(path: str | Path) -> PoseSpace:
+    """Read the mean pose and the principal components of a hand in MANO's schema.
+
+    Raises:
+        FileNotFoundError, ValueError: as `load`, or the file lacks `hands_mean` or `hands_components`.
+    """
+    fields = _read(Path(path))
+    missing = [name for name in _POSE_SPACE_SHAPES if name not in fields]
+    if missing:
+        raise ValueError(f"{path} must have {', '.join(_POSE_SPACE_SHAPES)}; missing: {', '.join(missing)}")
+    return PoseSpace(*(_checked(name, fields[name], str(path)) for name in _POSE_SPACE_SHAPES))
+
+
+def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(
             f"no hand model at {path}; give MANO_RIGHT.pkl or MANO_LEFT.pkl (from mano.is.tue.mpg.de), "
             "or an .npz with MANO's field names"
         )
     if path.suffix == ".npz":
-        fields = _read_npz(path)
-    elif path.suffix == ".pkl":
-        fields = _read_pickle(path)
-    else:
-        raise ValueError(f"{path} must end in .pkl or .npz; got {path.suffix or 'no suffix'!r}")
-    return _hand_model(fields, str(path), side)
+        return _read_npz(path)
+    if path.suffix == ".pkl":
+        return _read_pickle(path)
+    raise ValueError(f"{path} must end in .pkl or .npz; got {path.suffix or 'no suffix'!r}")
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
@@ -117,7 +137,7 @@ def _hand_model(fields: Mapping[str, Any], source: str, side: str | None) -> Han
 def _checked(name: str, value: Any, source: str) -> np.ndarray:
     """Return one field as a finite array of its type and shape."""
     array = _array(name, value, source)
-    expected = _SHAPES[name]
+    expected = {**_SHAPES, **_POSE_SPACE_SHAPES}[name]
     if array is None or array.dtype.kind not in "fiu":
         raise ValueError(f"`{name}` in {source} must be an array of numbers {expected}; got {_kind(value)}")
     if array.shape != expected:
