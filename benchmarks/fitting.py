@@ -1,5 +1,7 @@
 """Time and error of the fitting solvers on synthetic takes: `python benchmarks/fitting.py [--quick]`.
 
+`--figure FILE` draws the error over views and pixel noise instead (`pip install 'poem-jax[figures]'`).
+
 Own hand in natural poses, one unknown shape a take, cameras 1280 x 720 with f = 900 px, 0.7-1.2 m away. Both
 solvers see the same key points; neither uses a silhouette. The first call is stated apart; then the
 contestants take turns, and medians are reported. `adam-300` starts at the triangulated wrist with the flat
@@ -7,9 +9,11 @@ hand, or, marked "same start", where `lm` starts.
 """
 
 import argparse
+import importlib
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +35,8 @@ from poem_jax.hand.template import default_hand
 from poem_jax.synthetic.poses import sample_pose
 
 MODEL = keypoint_model(default_hand())
+FIGURE_VIEWS = (2, 3, 4, 6, 8)
+FIGURE_NOISE_PX = (0.5, 1.0, 2.0, 4.0)
 
 
 class Take(NamedTuple):
@@ -161,11 +167,42 @@ def error_row(
     return float(dlt), error_mm(result, take), error_mm(result, take, "vertices"), float(share)
 
 
+def figure(path: Path, frames: int, seeds: int) -> None:
+    """Print and draw the mean joint error of fit and DLT; the shape is unknown."""
+    fit = jax.jit(partial(fit_take, MODEL, config=FitConfig()))
+    rows: dict[float, np.ndarray] = {}
+    print("| noise, px | " + " | ".join(f"{views} views" for views in FIGURE_VIEWS) + " |")
+    print("|---" * (1 + len(FIGURE_VIEWS)) + "|")
+    for noise in FIGURE_NOISE_PX:
+        takes = [[make_take(frames, views, noise, 0.0, s) for s in range(seeds)] for views in FIGURE_VIEWS]
+        means = [np.mean([error_row(fit, t, ShapeMode.SHARED)[:2] for t in many], 0) for many in takes]
+        rows[noise] = np.array(means)
+        cells = " | ".join(f"{fitted:.2f} ({dlt:.2f})" for dlt, fitted in means)
+        print(f"| {noise:g} | {cells} |", flush=True)
+    # By name: type checkers run where the extra is not installed.
+    importlib.import_module("matplotlib").use("Agg")
+    drawing, axes = importlib.import_module("matplotlib.pyplot").subplots(figsize=(7, 4.2))
+    for index, (noise, errors) in enumerate(rows.items()):
+        axes.plot(FIGURE_VIEWS, errors[:, 1], "o-", color=f"C{index}", label=f"{noise:g} px")
+        axes.plot(FIGURE_VIEWS, errors[:, 0], ":", color=f"C{index}")
+    axes.set(xlabel="views", ylabel="mean joint error, mm", xticks=FIGURE_VIEWS, yscale="log")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend(title="noise of a coordinate")
+    axes.set_title("Fitted joints (lines) and triangulation alone (dotted)")
+    drawing.tight_layout()
+    drawing.savefig(path, dpi=110)
+
+
 def main() -> None:
-    """Print both tables."""
+    """Print both tables, or draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer frames, rounds and takes")
-    quick = parser.parse_args().quick
+    parser.add_argument("--figure", type=Path, help="PNG to draw")
+    given = parser.parse_args()
+    quick = given.quick
+    if given.figure:
+        figure(given.figure, frames=50, seeds=1 if quick else 4)
+        return
     time_table(frames=100 if quick else 500, rounds=3 if quick else 7)
     error_table(frames=50, seeds=2 if quick else 8)
 
