@@ -147,10 +147,11 @@ def test_anatomy_gradients(model64, rng):
 
 
 @pytest.mark.parity
-@pytest.mark.slow
 def test_anatomy_is_the_release(shared_dir):
     from poem_jax.fitting.kinematics import keypoint_model
 
+    # Tests in float32 that ran before leave index arrays converted for their precision in JAX's caches.
+    jax.clear_caches()
     folder = shared_dir / "reference" / "poem_v1"
     golden = np.load(folder / "golden_fit.npz")
     hand = load(folder / "fake_mano.npz")
