@@ -79,6 +79,8 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
     if boxes is None:
         assert keypoints is not None
         boxes = boxes_from_keypoints(keypoints)
+    if not len(boxes):
+        raise ValueError(f"{path} must hold at least one frame; got none")
     frames = _frames(content, len(boxes), path)
     if keypoints is not None and keypoints.shape[:3] != boxes.shape[:3]:
         raise ValueError(
@@ -125,7 +127,11 @@ def without_boxes_outside(boxes: HandBoxes, size_wh: Int[Array, "view 2"]) -> Ha
             "view %d: %s",
             *(outside.sum(), name, hand, view, boxes.boxes_px[frame, hand, view].round(1).tolist()),
         )
-    return boxes._replace(boxes_px=np.where(outside[..., None], np.nan, boxes.boxes_px))
+    seen = ~outside[..., None]
+    keypoints = boxes.keypoints_px
+    if keypoints is not None:
+        keypoints = np.where(seen[..., None], keypoints, np.nan)
+    return boxes._replace(boxes_px=np.where(seen, boxes.boxes_px, np.nan), keypoints_px=keypoints)
 
 
 def align_frames(

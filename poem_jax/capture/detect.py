@@ -26,6 +26,7 @@ MIN_DETECTION_CONFIDENCE = 0.5
 
 _SIDE_OF_LABEL = {"Left": "right", "Right": "left"}
 _FULL_MODEL = 1
+_SAME_PLACE = 0.5
 
 _log = logging.getLogger(__name__)
 
@@ -82,12 +83,35 @@ def detect_hands(
 
 
 def one_of_each_side(detections: Sequence[Detection]) -> dict[str, Detection]:
-    """Return at most one detection per side; of two that claim one side, the less sure is the other."""
-    ranked = sorted(detections, key=lambda found: -found.score)[: len(SIDES)]
-    if len(ranked) == 2 and ranked[0].side == ranked[1].side:
-        (other,) = (side for side in SIDES if side != ranked[0].side)
-        ranked[1] = ranked[1]._replace(side=other)
-    return {found.side: found for found in ranked}
+    """Return at most one detection per side, the surest first.
+
+    A second detection of one side is the other hand, if that was not found and lies elsewhere; else it is the
+    same hand again.
+    """
+    kept: dict[str, Detection] = {}
+    claimed = {found.side for found in detections}
+    for found in sorted(detections, key=lambda found: -found.score):
+        if found.side not in kept:
+            kept[found.side] = found
+            continue
+        (other,) = (side for side in SIDES if side != found.side)
+        if other not in claimed and other not in kept and not _overlap(found, kept[found.side]):
+            kept[other] = found._replace(side=other)
+    return kept
+
+
+def _overlap(a: Detection, b: Detection) -> bool:
+    """Tell whether two detections are of one place: the boxes' intersection is over half of their union."""
+    boxes = boxes_from_keypoints(np.stack([a.keypoints_px, b.keypoints_px]))
+    shared = np.clip(boxes[:, 2:].min(0) - boxes[:, :2].max(0), 0, None).prod()
+    areas = (boxes[:, 2:] - boxes[:, :2]).prod(-1)
+    return bool(shared > _SAME_PLACE * (areas.sum() - shared))
+
+
+def _inside(shares: Float[Array, "21 2"]) -> Float[Array, "21 2"]:
+    """Return shares of the image's size; NaN for guesses beyond its border."""
+    inside = ((shares >= 0) & (shares <= 1)).all(-1, keepdims=True)
+    return np.where(inside, shares, np.nan)
 
 
 def _mediapipe_detector() -> Callable[[UInt8[Array, "h w 3"]], Sequence[Detection]]:
@@ -109,7 +133,7 @@ def _mediapipe_detector() -> Callable[[UInt8[Array, "h w 3"]], Sequence[Detectio
             Detection(
                 _SIDE_OF_LABEL[sides.classification[0].label],
                 sides.classification[0].score,
-                np.array([[point.x * width, point.y * height] for point in hand.landmark]),
+                _inside(np.array([[point.x, point.y] for point in hand.landmark])) * (width, height),
             )
             for hand, sides in pairs
         ]

@@ -17,17 +17,13 @@ from tqdm import tqdm
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
-from poem_jax.capture.keypoint_agreement import (
-    check_triangulation,
-    judge_fit,
-    warn_of_pairs,
-)
+from poem_jax.capture.keypoint_agreement import check_triangulation, fits_badly, judge_fit, judge_pairs
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
 from poem_jax.capture.rig_file import read_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.capture.take import FrameOutcome, HandOutcome, Take, read_frame
-from poem_jax.geometry.distortion import undistort_pixels
+from poem_jax.geometry.distortion import distort_pixels, undistort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.topology import ROOT_JOINT
@@ -37,6 +33,8 @@ if TYPE_CHECKING:
     from poem_jax.fitting.solvers import FitConfig, FitResult
 
 NOT_FITTED = "fewer than three joints are seen by two views that agree on them"
+
+_MISSED_PX = 0.5
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +86,8 @@ def read_keypoint_take(
     hands = align_frames(hands, names, found.num_views, keypoints)
     nothing = (None,) * found.num_views
     frames = [by_key.get(frame_key(name), FramePaths(name, nothing)) for name in names]
+    if len(pictures) == len(names) == 1:
+        frames = pictures
     if pictures and not any(frame in pictures for frame in frames):
         raise ValueError(
             f"{images}: no frame of it ({', '.join(frame.name for frame in pictures[:3])}) is among those of "
@@ -128,14 +128,21 @@ def fit(
     hands = hands_of(default_hand() if hand is None else hand)
     keypoints = ideal_keypoints(take.rig, take.hands.keypoints_px)
     check_triangulation(take, keypoints)
-    warn_of_pairs(take.rig, keypoints)
+    warnings = judge_pairs(take.rig, keypoints)
     clock.lap("triangulate_with_compilation")
     config = fit_config(smooth)
-    results = [_fit_hand(take, keypoints, hands, index, config) for index in range(len(take.hand_names))]
+    results = []
+    for index in range(len(take.hand_names)):
+        fitted, said = _fit_hand(take, keypoints, hands, index, config)
+        results.append(fitted)
+        warnings += said
+    for warning in warnings:
+        _log.warning("%s", warning)
     clock.lap("fit_with_compilation")
     frames = _stream(take, results, progress)
     faces = {"right": hands.right.faces, "left": hands.left.faces}
-    about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
+    kind = "shipped hand" if hand is None else "given"
+    about = {"engine": "fit", "hand": kind, "smooth": smooth, "warnings": warnings}
     return write_results(take, out, frames, faces, clock, about)
 
 
@@ -150,10 +157,16 @@ def fit_config(smooth: bool) -> "FitConfig":
 def ideal_keypoints(
     rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]
 ) -> Float[Array, "frame hand view 21 2"]:
-    """Return the key points of the undistorted images with the rig's `K`; NaN stays NaN."""
+    """Return the key points of the undistorted images with the rig's `K`.
+
+    NaN stays NaN; points beyond the fold of a lens, which no ray reaches, become NaN.
+    """
     by_view = np.moveaxis(np.nan_to_num(keypoints_px), 2, 0)
     flat = by_view.reshape(rig.num_views, -1, 2)
-    ideal = np.moveaxis(undistort_pixels(flat, rig.K, rig.dist).reshape(by_view.shape), 0, 2)
+    ideal = undistort_pixels(flat, rig.K, rig.dist)
+    missed = np.linalg.norm(distort_pixels(ideal, rig.K, rig.dist) - flat, axis=-1, keepdims=True)
+    ideal = np.where(missed < _MISSED_PX, ideal, np.nan)
+    ideal = np.moveaxis(ideal.reshape(by_view.shape), 0, 2)
     return np.where(np.isfinite(keypoints_px), ideal, np.nan)
 
 
@@ -167,18 +180,18 @@ def _check_take(take: Take) -> None:
     check_each_camera(take.rig)
 
 
-def _fit_hand(take: Take, keypoints: Array, hands: Hands, index: int, config: "FitConfig") -> "FitResult":
-    """Fit one hand, and say so where the other side or no hand at all would fit better."""
+def _fit_hand(
+    take: Take, keypoints: Array, hands: Hands, index: int, config: "FitConfig"
+) -> tuple["FitResult", list[str]]:
+    """Fit one hand; where it fits badly, try the other side, and return what is to be said."""
     side = take.hands.hand_side[index]
     confidence = take.hands.confidence
     confidence = np.ones(keypoints[:, index].shape[:-1]) if confidence is None else confidence[:, index]
-    fitted = [
-        _run(model, keypoints[:, index], confidence, take.rig, config)
-        for model in (hands.of(side), hands.other(side))
-    ]
-    for warning in judge_fit(take, keypoints[:, index], take.hand_names[index], *fitted):
-        _log.warning("%s", warning)
-    return fitted[0]
+    evidence = (keypoints[:, index], confidence, take.rig, config)
+    own = _run(hands.of(side), *evidence)
+    if not fits_badly(own):
+        return own, []
+    return own, judge_fit(take.hand_names[index], own, _run(hands.other(side), *evidence))
 
 
 def _run(hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig") -> "FitResult":
@@ -228,7 +241,9 @@ def _outcome(take: Take, frame: int, index: int, fitted: "FitResult") -> HandOut
         translation=fitted.translation[frame],
         joint_sigma_m=fitted.sigma_m[frame],
     )
-    errors = reprojection_error(joints, given_evidence(take.hands, frame, index), used, take.rig)
+    evidence = given_evidence(take.hands, frame, index)
+    seen = np.isfinite(evidence.points_px).all(-1).any(-1)
+    errors = reprojection_error(joints, evidence, seen, take.rig)
     return HandOutcome(result, used, errors, joints_shown(joints, used, take.rig))
 
 

@@ -7,7 +7,6 @@ them.
 """
 
 import functools
-import logging
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -37,8 +36,6 @@ _AGREEING = (0.75, 0.9)
 """Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
 their inverses are right."""
 
-_log = logging.getLogger(__name__)
-
 
 def epipolar_distances_px(
     rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]
@@ -64,23 +61,22 @@ def epipolar_distances_px(
     return distances
 
 
-def warn_of_pairs(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
-    """Warn of the cameras whose key points do not fit together, by name."""
+def judge_pairs(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> list[str]:
+    """Return a warning that names the cameras whose key points do not fit together, if there are any."""
     distances = epipolar_distances_px(rig, keypoints_px)
     limit = _SUSPICIOUS_SHARE * np.linalg.norm(rig.size_wh, axis=-1).mean()
     pairs = [(a, b) for a, b in combinations(range(rig.num_views), 2) if distances[a, b] > limit]
     if not pairs:
-        return
+        return []
     named = ", ".join(
         f"'{rig.names[a]}' and '{rig.names[b]}' {distances[a, b]:.0f} px"
         for a, b in sorted(pairs, key=lambda pair: -distances[pair])
     )
-    _log.warning(
-        "the key points of these cameras do not fit together: %s off each other's epipolar lines (median; "
-        "expected below %.0f px). Calibration, or frames that are not of one moment? The results are not to "
-        "be trusted to the millimetre",
-        *(named, limit),
-    )
+    return [
+        f"the key points of these cameras do not fit together: {named} off each other's epipolar lines "
+        f"(median; expected below {limit:.0f} px). Calibration, or frames that are not of one moment? The "
+        "results are not to be trusted to the millimetre"
+    ]
 
 
 def check_triangulation(take: Take, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
@@ -109,38 +105,37 @@ def check_triangulation(take: Take, keypoints_px: Float[Array, "frame hand view 
         )
 
 
-def judge_fit(
-    take: Take,
-    keypoints_px: Float[Array, "frame view 21 2"],
-    name: str,
-    own: "FitResult",
-    other: "FitResult",
-) -> list[str]:
+def fits_badly(fitted: "FitResult", least_ratio: float = 2.0) -> bool:
+    """Tell whether a hand is further from its key points than their noise explains."""
+    return bool(_median_error(fitted) > least_ratio * _expected_error(fitted))
+
+
+def judge_fit(name: str, own: "FitResult", other: "FitResult") -> list[str]:
     """Return warnings: the hand is of the other side, or its key points are in another order.
 
     Args:
-        take: The capture.
-        keypoints_px: Of one hand, ideal pixels.
         name: Of the hand.
         own: The fit of the side that the file names.
         other: The fit of the opposite side.
     """
     error, error_other = _median_error(own), _median_error(other)
-    if not np.isfinite([error, error_other]).all():
-        return []
     if error_other < _FITS_BETTER * error:
         return [
             f"hand '{name}' seems to be of the other side: it fits the key points to {error:.1f} px, its "
             f"mirror image to {error_other:.1f} px; check `hand_side`"
         ]
-    noise = float(_triangulated(take.rig, keypoints_px[:, None]).sigma_px.max())
-    if error > _FITS_NOT * max(noise, 1.0) * np.sqrt(2):
+    if fits_badly(own, _FITS_NOT):
         return [
-            f"hand '{name}': the views agree with each other to {noise:.1f} px, but no hand fits the key "
-            f"points better than {error:.1f} px; check that the joints are in OpenPose order (wrist, then "
-            "thumb to little finger, each from its base to its tip)"
+            f"hand '{name}': the views agree with each other to {_expected_error(own):.1f} px, but no hand "
+            f"fits the key points better than {error:.1f} px; check that the joints are in OpenPose order "
+            "(wrist, then thumb to little finger, each from its base to its tip)"
         ]
     return []
+
+
+def _expected_error(fitted: "FitResult") -> float:
+    """Return the distance that the noise of the key points alone gives, pixels."""
+    return max(float(np.max(fitted.sigma_px)), 1.0) * np.sqrt(2)
 
 
 def _agreeing_share(points: "RobustPoints", keypoints_px: Array) -> float:

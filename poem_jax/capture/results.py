@@ -128,7 +128,10 @@ def _check_any(take: Take, outcomes: list[FrameOutcome]) -> None:
     lost = (problem.error for outcome in outcomes for problem in outcome.problems if problem.needed)
     if (error := next(lost, None)) is not None:
         raise error
-    views = int(np.isfinite(take.hands.boxes_px).all(-1).sum(-1).max(initial=0))
+    seen = np.isfinite(take.hands.boxes_px).all(-1)
+    if take.hands.keypoints_px is not None:
+        seen |= np.isfinite(take.hands.keypoints_px).all(-1).any(-1)
+    views = int(seen.sum(-1).max(initial=0))
     if views < 2:
         raise ValueError(
             f"no hand could be reconstructed: at least two views must see it; at most {views} of "
@@ -166,7 +169,7 @@ def _report(
         **about,
         "cameras": list(take.rig.names),
         "hands": list(take.hand_names),
-        "failed_frames": sum(bool(outcome.problems) and not outcome.solved for outcome in outcomes),
+        "failed_frames": sum(outcome.failed for outcome in outcomes),
         "frames": [frame_report(take, frame, outcome) for frame, outcome in enumerate(outcomes)],
         "versions": versions(),
     }

@@ -80,6 +80,11 @@ class FrameOutcome(NamedTuple):
         """Whether any hand was reconstructed."""
         return any(hand.result is not None for hand in self.hands)
 
+    @property
+    def failed(self) -> bool:
+        """Whether there was something to reconstruct, and nothing was."""
+        return not self.solved and (bool(self.problems) or any(hand.view_mask.any() for hand in self.hands))
+
 
 def read_take(
     folder: str | os.PathLike, rig: str | os.PathLike | None = None, boxes: str | os.PathLike | None = None

@@ -121,7 +121,9 @@ def fitting_loss(
     square = jnp.sum((pixels - uv_px) ** 2, axis=-1)
     keypoints = jnp.mean(weights * square) / diagonal_px**2
     anatomy = anatomy_loss(
-        anatomy_terms(parameters.quaternions, parameters.shape, posed.rotations, posed.points)
+        anatomy_terms(
+            parameters.quaternions, parameters.shape, posed.rotations, posed.points, model.hand.is_left
+        )
     )
     return KEYPOINT_WEIGHT * keypoints + ANATOMY_WEIGHT * anatomy, keypoints
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle, transpose
 from poem_jax.hand.topology import NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE
-from poem_jax.typing import Array, Float
+from poem_jax.typing import Array, Bool, Float
 
 LEAST_ANGLE = 0.01
 """Radians."""
@@ -51,6 +51,7 @@ def anatomy_terms(
     shape: Float[Array, "*batch 10"],
     rotations: Float[Array, "*batch 16 3 3"],
     joints: Float[Array, "*batch 21 3"],
+    is_left: bool | Bool[Array, ""] = False,
 ) -> AnatomyTerms:
     """Return all six terms of a pose.
 
@@ -59,8 +60,10 @@ def anatomy_terms(
         shape: about N(0, 1).
         rotations: world rotations of the joints that the quaternions give.
         joints: the posed key points, OpenPose order, metres.
+        is_left: the hand is a left one. (The release knows right ones; a left hand's terms are those of its
+            mirror image.)
     """
-    axes = bone_axes(rotations, joints)
+    axes = bone_axes(rotations, joints, is_left)
     axis, angle = axis_and_angle(axis_angle_from_raw_quaternion(quaternions)[..., 1:, :])
     return AnatomyTerms(
         quaternion_norm(quaternions),
@@ -113,11 +116,16 @@ def wrong_way(
     return _grouped(missing, knuckle, thumb, angle)
 
 
-def bone_axes(rotations: Float[Array, "*batch 16 3 3"], joints: Float[Array, "*batch 21 3"]) -> BoneAxes:
+def bone_axes(
+    rotations: Float[Array, "*batch 16 3 3"],
+    joints: Float[Array, "*batch 21 3"],
+    is_left: bool | Bool[Array, ""] = False,
+) -> BoneAxes:
     """Return b, u and l of every bending joint, in the joint's own frame."""
     bone = joints[..., _JOINTS, :] - joints[..., _JOINTS + 1, :]
     b = _unit(matmul(transpose(rotations[..., 1:, :, :]), bone[..., None])[..., 0])
-    l = _unit(jnp.cross(b, jnp.asarray(_UP, b.dtype)))  # noqa: E741
+    up = jnp.asarray(_UP, b.dtype) * jnp.where(is_left, jnp.asarray([-1, 1, 1], b.dtype), 1)
+    l = _unit(jnp.cross(b, up))  # noqa: E741
     return BoneAxes(b, jnp.cross(l, b), l)
 
 

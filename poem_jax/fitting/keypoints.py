@@ -71,8 +71,8 @@ def triangulate_robust(
         uv_px: key points (*batch, view, joint, 2); non-finite ones are ignored.
         K: (*batch, view, 3, 3) of the images in which `uv_px` is measured; its batch axes broadcast.
         T_cam_from_world: (*batch, view, 4, 4), metres; likewise.
-        confidence: inverse variance of each key point (*batch, view, joint), relative; zero, negative or NaN
-            means "ignore".
+        confidence: inverse variance of each key point (*batch, view, joint), on any scale; zero, negative or
+            NaN means "ignore".
         mask: (*batch, view, joint); False means "ignore", whatever the other arguments hold there.
         gate_px: views further off than this are outliers.
         take_axis: batch axis (say, of frames) over which the noise is estimated together; None estimates it
@@ -84,15 +84,11 @@ def triangulate_robust(
     Raises:
         ValueError: fewer than two views, or key points and cameras of different numbers of views.
     """
-    uv, weights = _clean_inputs(uv_px, K, confidence, mask)
-    batch = uv.shape[:-3]
-    K = jnp.broadcast_to(K, (*batch, *K.shape[-3:]))
-    T = jnp.broadcast_to(T_cam_from_world, (*batch, *T_cam_from_world.shape[-3:]))
+    uv, weights, K, T = _clean_inputs(uv_px, K, T_cam_from_world, confidence, mask, take_axis)
     start, inliers = _vote(uv, weights, K, T, gate_px)
     points = _refine(start, uv, weights * inliers, K, T)
     sigma = _noise(points, uv, weights * inliers, K, T, take_axis)
-    gate = jnp.minimum(gate_px, jnp.maximum(GATE_SIGMAS * sigma, GATE_SIGMAS * MIN_SIGMA_PX))
-    inliers = _agreeing(points, uv, weights, K, T, gate)
+    inliers = _agreeing(points, uv, weights, K, T, GATE_SIGMAS * sigma, gate_px)
     inliers = inliers & (jnp.sum(inliers, -2, keepdims=True) >= _FEWEST_VIEWS)
     used = weights * inliers
     points = _refine(points, uv, used, K, T)
@@ -100,24 +96,66 @@ def triangulate_robust(
     return _with_uncertainty(points, uv, used, K, T, sigma)
 
 
+def relative_confidence(
+    confidence: Float[Array, "*batch view joint"],
+    usable: Bool[Array, "*batch view joint"],
+    take_axis: int | None,
+) -> Float[Array, "*batch view joint"]:
+    """Return confidences scaled to a mean of 1 over the usable key points of a take; zero elsewhere."""
+    axes = (-2, -1) if take_axis is None else (take_axis, -2, -1)
+    kept = jnp.where(usable, confidence, 0)
+    total, count = (jnp.sum(x, axis=axes, keepdims=True) for x in (kept, usable))
+    return kept * count / jnp.where(total > 0, total, 1)
+
+
+def usable_keypoints(
+    uv_px: Float[Array, "*batch view joint 2"],
+    cameras_known: Bool[Array, "*batch view"],
+    confidence: Float[Array, "*batch view joint"] | None,
+    mask: Bool[Array, "*batch view joint"] | None,
+) -> Bool[Array, "*batch view joint"]:
+    """Tell the key points that are finite, trusted, unmasked, and of a known camera."""
+    usable = jnp.all(jnp.isfinite(uv_px), axis=-1) & cameras_known[..., None]
+    usable = usable if mask is None else usable & mask
+    return usable if confidence is None else usable & jnp.isfinite(confidence) & (confidence > 0)
+
+
 def _clean_inputs(
-    uv_px: Array, K: Array, confidence: Array | None, mask: Array | None
-) -> tuple[Float[Array, "*batch view joint 2"], Float[Array, "*batch view joint"]]:
-    """Return finite pixels, and weights that are zero where a key point does not count."""
+    uv_px: Array,
+    K: Array,
+    T_cam_from_world: Array,
+    confidence: Array | None,
+    mask: Array | None,
+    take_axis: int | None,
+) -> tuple[
+    Float[Array, "*batch view joint 2"],
+    Float[Array, "*batch view joint"],
+    Float[Array, "*batch view 3 3"],
+    Float[Array, "*batch view 4 4"],
+]:
+    """Return finite pixels, weights that are zero where a key point does not count, and finite cameras."""
     views = uv_px.shape[-3]
     if views < _FEWEST_VIEWS:
         raise ValueError(f"triangulation needs at least two views; got `uv_px` of shape {uv_px.shape}")
     if K.shape[-3] != views:
         raise ValueError(f"`uv_px` has {views} views, the cameras {K.shape[-3]}; they must be the same")
     uv_px = jnp.asarray(uv_px)
-    usable = jnp.all(jnp.isfinite(uv_px), axis=-1)
-    if mask is not None:
-        usable = usable & mask
-    weights = jnp.ones(usable.shape, uv_px.dtype)
+    K, T, known = finite_cameras(K, T_cam_from_world, uv_px.shape[:-3])
+    usable = usable_keypoints(uv_px, known, confidence, mask)
+    weights = usable.astype(uv_px.dtype)
     if confidence is not None:
-        usable = usable & jnp.isfinite(confidence) & (confidence > 0)
-        weights = jnp.where(usable, confidence, 0).astype(uv_px.dtype)
-    return jnp.where(usable[..., None], uv_px, 0), jnp.where(usable, weights, 0)
+        weights = relative_confidence(jnp.asarray(confidence, uv_px.dtype), usable, take_axis)
+    return jnp.where(usable[..., None], uv_px, 0), weights, K, T
+
+
+def finite_cameras(
+    K: Float[Array, "..."], T_cam_from_world: Float[Array, "..."], batch: tuple[int, ...]
+) -> tuple[Float[Array, "*batch view 3 3"], Float[Array, "*batch view 4 4"], Bool[Array, "*batch view"]]:
+    """Broadcast cameras over `batch`; those that are not finite become identities and are not known."""
+    K, T = (jnp.broadcast_to(x, (*batch, *x.shape[-3:])) for x in map(jnp.asarray, (K, T_cam_from_world)))
+    known = jnp.all(jnp.isfinite(K), (-2, -1)) & jnp.all(jnp.isfinite(T), (-2, -1))
+    K = jnp.where(known[..., None, None], K, jnp.eye(3, dtype=K.dtype))
+    return K, jnp.where(known[..., None, None], T, jnp.eye(4, dtype=T.dtype)), known
 
 
 def _vote(
@@ -172,11 +210,12 @@ def _square_errors(
 
 
 def _agreeing(
-    points: Array, uv: Array, weights: Array, K: Array, T: Array, gate: Array
+    points: Array, uv: Array, weights: Array, K: Array, T: Array, gate: Array, gate_px: float
 ) -> Bool[Array, "*batch view joint"]:
-    """Tell the views within `gate` (px, of confidence 1) of each point."""
+    """Tell the views within `gate` (px, of confidence 1) and `gate_px` of each point."""
     error2, in_front = _square_errors(points, uv, K, T)
-    return (weights > 0) & in_front & (error2 < gate[..., None, None] ** 2)
+    near = (weights * error2 < gate[..., None, None] ** 2) & (error2 < gate_px**2)
+    return (weights > 0) & in_front & near
 
 
 def projection_jacobian(
@@ -217,7 +256,7 @@ def _refine(points: Array, uv: Array, weights: Array, K: Array, T: Array) -> Flo
     def step(points: Array, _: None) -> tuple[Array, None]:
         H, g = _normal_equations(points, uv, weights, K, T)
         step = jnp.sum(_inverse(H, solvable) * g[..., None, :], axis=-1)
-        length = jnp.linalg.norm(jnp.where(solvable, step, 1), axis=-1, keepdims=True)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(jnp.where(solvable, step, 1) ** 2, -1, keepdims=True), 1e-20))
         return points - jnp.where(solvable, step * jnp.minimum(1, 0.1 / length), 0), None
 
     # A loop of the program: written out, XLA:CPU fuses the steps into one kernel that overflows its stack.

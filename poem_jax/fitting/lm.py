@@ -88,7 +88,7 @@ class TakeObservations(NamedTuple):
     K: Float[Array, "frame view 3 3"]
     T_cam_from_world: Float[Array, "frame view 4 4"]
     frame_mask: Bool[Array, "frame"]
-    """False: the frame keeps its start and says nothing about the shape."""
+    """False: the frame keeps its start, and says nothing about the shape, which it takes from the others."""
 
 
 class TakeState(NamedTuple):
@@ -133,7 +133,7 @@ def joint_sigma(
     sqrt(trace / 3) of D H^-1 D^T, plus what the shape's own uncertainty adds where it is estimated.
     """
     equations = normal_equations(model, take, state, config.robust_sigmas, config)
-    factor = _factor(equations.H, jnp.zeros_like(take.frame_mask, state.pose.dtype))
+    factor = _factor(equations.H, jnp.full_like(take.frame_mask, _LEAST_DAMPING, state.pose.dtype))
     D = equations.D.reshape(-1, NUM_JOINTS * 3, STATE_SIZE)
     spread = _solve(factor, jnp.swapaxes(D, -1, -2))
     variance = jnp.sum(D * jnp.swapaxes(spread, -1, -2), axis=-1)
@@ -196,25 +196,41 @@ def _iteration(
     trial = apply_step(state, dx, dshape)
     before = frame_cost(model, take, state, scale, config)
     after = frame_cost(model, take, trial, scale, config)
-    lower = after < before
-    accepted = _accepted(before, after, take, state, trial, config) & take.frame_mask
-    state = jax.tree.map(lambda new, old: jnp.where(_along(accepted, new), new, old), trial, state)
-    damping = jnp.where(lower & accepted, damping / 4, damping * 8)
+    after = jnp.where(jnp.isfinite(after), after, jnp.inf)
+    if config.shape_mode is ShapeMode.SHARED:
+        reshaped = state._replace(shape=trial.shape)
+        held = frame_cost(model, take, reshaped, scale, config)
+        moves, reshapes = _accepted_together(before, after, held, take, state, trial)
+    else:
+        old, new = (0.5 * jnp.sum(shape_prior(s.shape) ** 2, axis=-1) for s in (state, trial))
+        moves = reshapes = (after + new < before + old) & take.frame_mask
+    chosen = TakeState(moves, moves, reshapes)
+    state = jax.tree.map(
+        lambda new, old, take_it: jnp.where(_along(take_it, new), new, old), trial, state, chosen
+    )
+    damping = jnp.where((after < before) & moves, damping / 4, damping * 8)
     return state, jnp.clip(damping, _LEAST_DAMPING, _MOST_DAMPING)
 
 
-def _accepted(
-    before: Array, after: Array, take: TakeObservations, state: TakeState, trial: TakeState, config: LMConfig
-) -> Bool[Array, "frame"]:
-    """Tell which frames take the step: each by its own cost, or all together where they share the shape."""
-    after = jnp.where(jnp.isfinite(after), after, jnp.inf)
-    if config.shape_mode is ShapeMode.GIVEN:
-        return after < before
-    old, new = (0.5 * jnp.sum(shape_prior(s.shape) ** 2, axis=-1) for s in (state, trial))
-    if config.shape_mode is ShapeMode.PER_FRAME:
-        return after + new < before + old
-    total = jnp.sum(jnp.where(take.frame_mask, after - before, 0)) + new[0] - old[0]
-    return jnp.broadcast_to(total < 0, before.shape)
+def _accepted_together(
+    before: Float[Array, "frame"],
+    after: Float[Array, "frame"],
+    held: Float[Array, "frame"],
+    take: TakeObservations,
+    state: TakeState,
+    trial: TakeState,
+) -> tuple[Bool[Array, "frame"], Bool[Array, "frame"]]:
+    """Tell which frames move, and whether all take the new shape, which they share.
+
+    A frame that would get worse by moving keeps its place under the new shape (cost `held`), so that one wild
+    frame cannot hold back the take; the shape is taken if the sum falls.
+    """
+    better = (after < held) | ~jnp.isfinite(held)
+    counted = take.frame_mask & jnp.isfinite(before)
+    change = jnp.where(better, after, held) - before
+    old, new = (0.5 * jnp.sum(shape_prior(s.shape[0]) ** 2) for s in (state, trial))
+    falls = jnp.sum(jnp.where(counted & jnp.isfinite(change), change, 0)) + new - old < 0
+    return better & jnp.isfinite(after) & take.frame_mask & falls, jnp.broadcast_to(falls, before.shape)
 
 
 def _damped_step(
@@ -244,7 +260,8 @@ def _reduced_shape(
     g = equations.g_shape
     if solved_g is not None:
         g = g - matmul(across, solved_g[..., None])[..., 0]
-    S, g = jnp.where(take.frame_mask[:, None, None], S, 0), jnp.where(take.frame_mask[:, None], g, 0)
+    counted = take.frame_mask & jnp.all(jnp.isfinite(S), (-2, -1)) & jnp.all(jnp.isfinite(g), -1)
+    S, g = jnp.where(counted[:, None, None], S, 0), jnp.where(counted[:, None], g, 0)
     if config.shape_mode is ShapeMode.SHARED:
         S, g = (jnp.broadcast_to(jnp.sum(x, 0, keepdims=True), x.shape) for x in (S, g))
     return S + jnp.eye(NUM_SHAPES, dtype=S.dtype), g + shape_prior(state.shape)

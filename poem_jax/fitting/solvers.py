@@ -14,7 +14,14 @@ import jax.numpy as jnp
 
 from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
 from poem_jax.fitting.anatomy import rotations_from_raw_quaternions
-from poem_jax.fitting.keypoints import RobustPoints, projection_jacobian, triangulate_robust
+from poem_jax.fitting.keypoints import (
+    RobustPoints,
+    finite_cameras,
+    projection_jacobian,
+    relative_confidence,
+    triangulate_robust,
+    usable_keypoints,
+)
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
 from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState, joint_sigma, solve
 from poem_jax.fitting.smooth import SmoothConfig, smooth
@@ -61,6 +68,8 @@ class FitResult(NamedTuple):
     """Standard deviation of one coordinate of each joint; zero where not `valid`."""
     inlier_mask: Bool[Array, "frame view 21"]
     """The key points that agree with each other, and were fitted."""
+    sigma_px: Float[Array, "frame"]
+    """Estimated noise of one coordinate of a key point, pixels."""
 
 
 def fit_take(
@@ -80,7 +89,7 @@ def fit_take(
         keypoints_px: (frame, view, 21, 2) OpenPose order; NaN = unseen.
         K: (view, 3, 3) or (frame, view, 3, 3) of these (undistorted) pixels.
         T_cam_from_world: (view, 4, 4) or (frame, view, 4, 4), metres.
-        confidence: (frame, view, 21) inverse variance, relative; NaN or zero = unseen; None means 1.
+        confidence: (frame, view, 21) inverse variance, on any scale; NaN or zero = unseen; None means equal.
         mask: (frame, view, 21); False means "ignore".
         shape: the known shape (10,) or (frame, 10); needed by, and only used in, `ShapeMode.GIVEN`.
         config: static under `jax.jit`.
@@ -95,7 +104,7 @@ def fit_take(
     if config.smooth is not None:
         state = smooth(model, take, state, config.lm, config.smooth)
     sigma = joint_sigma(model, take, state, config.lm)
-    return _result(model, keypoints_px, confidence, mask, take, state, sigma)
+    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px)
 
 
 def fit_take_adam(
@@ -134,9 +143,8 @@ def fit_take_adam(
     found = jax.vmap(one)(take.uv_px, weights, take.K, take.T_cam_from_world, start)
     pose = axis_angle_from_rotation(rotations_from_raw_quaternions(found.quaternions))
     state = TakeState(pose, found.translation, found.shape)
-    return _result(
-        model, keypoints_px, confidence, mask, take, state, jnp.zeros((*pose.shape[:1], NUM_JOINTS))
-    )
+    sigma = jnp.zeros((*pose.shape[:1], NUM_JOINTS))
+    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px)
 
 
 def _check(uv: Array, K: Array, T: Array, shape: Array | None, config: FitConfig) -> None:
@@ -160,17 +168,14 @@ def _observe(
     uv: Array, K: Array, T: Array, confidence: Array | None, mask: Array | None, config: FitConfig
 ) -> tuple[TakeObservations, RobustPoints]:
     """Triangulate, and keep the key points that agree with it as observations."""
-    frames = uv.shape[0]
-    K, T = (jnp.broadcast_to(x, (frames, *x.shape[-3:])) for x in (jnp.asarray(K), jnp.asarray(T)))
-    known = jnp.all(jnp.isfinite(K), (-2, -1)) & jnp.all(jnp.isfinite(T), (-2, -1))
-    K = jnp.where(known[..., None, None], K, jnp.eye(3, dtype=K.dtype))
-    T = jnp.where(known[..., None, None], T, jnp.eye(4, dtype=T.dtype))
-    seen = jnp.broadcast_to(known[..., None], uv.shape[:-1])
-    seen = seen if mask is None else seen & mask
+    uv = jnp.asarray(uv)
+    K, T, known = finite_cameras(K, T, uv.shape[:1])
+    seen = usable_keypoints(uv, known, confidence, mask)
     points = triangulate_robust(uv, K, T, confidence, seen, gate_px=config.gate_px, take_axis=0)
-    relative = 1.0 if confidence is None else jnp.nan_to_num(jnp.asarray(confidence))
+    trusted = jnp.ones(seen.shape, uv.dtype) if confidence is None else jnp.asarray(confidence, uv.dtype)
+    relative = relative_confidence(trusted, seen, 0)
     sigma = jnp.maximum(points.sigma_px, _LEAST_SIGMA_PX)
-    weights = jnp.where(points.inlier_mask, relative / sigma[:, None, None] ** 2, 0).astype(uv.dtype)
+    weights = jnp.where(points.inlier_mask, relative / sigma[:, None, None] ** 2, 0)
     enough = jnp.sum(points.valid, -1) >= FEWEST_JOINTS
     clean = jnp.where(points.inlier_mask[..., None], uv, 0)
     return TakeObservations(clean, weights, K, T, enough), points
@@ -196,6 +201,7 @@ def _result(
     take: TakeObservations,
     state: TakeState,
     sigma: Array,
+    sigma_px: Array,
 ) -> FitResult:
     translation = state.wrist - rest_wrist(model, state.shape)
     mesh = hand_mesh(model.hand, state.pose, state.shape, translation)
@@ -206,7 +212,7 @@ def _result(
     distance = jnp.linalg.norm(pixels - jnp.where(counted[..., None], keypoints_px, pixels + 1), axis=-1)
     count = jnp.sum(counted, axis=-1)
     mean = jnp.sum(jnp.where(counted, distance, 0), axis=-1) / jnp.maximum(count, 1)
-    finite = jnp.all(jnp.isfinite(mesh.joints), axis=(-2, -1))
+    finite = jnp.all(jnp.isfinite(mesh.joints), axis=(-2, -1)) & jnp.all(jnp.isfinite(sigma), axis=-1)
     valid = take.frame_mask & finite
     return FitResult(
         state.pose,
@@ -218,4 +224,5 @@ def _result(
         jnp.where((count > 0) & valid[:, None], mean, jnp.nan),
         jnp.where(valid[:, None], sigma, 0),
         take.weights > 0,
+        sigma_px,
     )

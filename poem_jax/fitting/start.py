@@ -20,7 +20,9 @@ FEWEST_JOINTS = 3
 
 _SKELETON = np.array(SKELETON_FROM_OPENPOSE)
 _CHAINS = np.arange(1, NUM_SKELETON_JOINTS).reshape(5, 3)
-_PALM = np.isin(np.arange(NUM_JOINTS), [WRIST, 5, 9, 13, 17])
+_PALM = np.isin(np.arange(NUM_JOINTS), [WRIST, 1, 5, 9, 13, 17])
+"""Wrist, thumb base and knuckles: rigid, whatever the pose."""
+_HEEL = np.isin(np.arange(NUM_JOINTS), [WRIST, 1])
 _MIN_COSINE_SUM = 1e-2
 
 
@@ -43,7 +45,9 @@ def closed_form_pose(
         model, jnp.zeros((*shape.shape[:-1], NUM_SKELETON_JOINTS, 3), shape.dtype), shape
     ).points
     palm = valid & _PALM
-    used = jnp.where(jnp.sum(palm, -1, keepdims=True) >= FEWEST_JOINTS, palm, valid)
+    # The knuckles alone lie nearly on one line, about which the palm could turn.
+    enough = (jnp.sum(palm, -1) >= FEWEST_JOINTS) & jnp.any(valid & _HEEL, -1)
+    used = jnp.where(enough[..., None], palm, valid)
     fit = procrustes(rest, joints_world, with_scale=False, mask=used)
     joints = jnp.where(valid[..., None], joints_world, apply_similarity(fit, rest))
     pose = axis_angle_from_rotation(_local_turns(fit.R, rest, joints))

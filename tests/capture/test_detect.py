@@ -1,6 +1,8 @@
-"""Key points from images: sides, missing images, and, where MediaPipe is installed, the real thing."""
+"""Key points from images: sides, places, missing images, and how MediaPipe is asked."""
 
+import importlib
 import importlib.util
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -42,9 +44,56 @@ def test_hands_go_to_their_side_frame_and_view(capture, caplog):
     assert "1b.png" in caplog.text
 
 
+def scores(*detections: Detection) -> dict[str, float]:
+    return {side: hand.score for side, hand in one_of_each_side(detections).items()}
+
+
 def test_of_two_hands_of_one_side_the_less_sure_is_the_other():
-    kept = one_of_each_side([found("right", 0.6), found("right", 0.9), found("left", 0.1)])
-    assert {side: hand.score for side, hand in kept.items()} == {"right": 0.9, "left": 0.6}
+    assert scores(found("right", 0.6, 100.0), found("right", 0.9)) == {"right": 0.9, "left": 0.6}
+
+
+def test_one_hand_found_twice_is_one_hand():
+    assert scores(found("right", 0.6, 2.0), found("right", 0.9)) == {"right": 0.9}
+
+
+def test_a_side_that_was_found_is_not_replaced():
+    hands = found("right", 0.6, 100.0), found("right", 0.9), found("left", 0.1, 200.0)
+    assert scores(*hands) == {"right": 0.9, "left": 0.1}
+
+
+def test_mediapipe_is_asked_and_understood(capture, monkeypatch):
+    """A stand-in for MediaPipe: mirrored sides, shares of the image, guesses beyond its border."""
+    frames, rig = capture
+    asked = {}
+
+    class Hands:
+        def __init__(self, **options):
+            asked.update(options)
+
+        def process(self, image):
+            points = [SimpleNamespace(x=0.25 + 0.01 * i, y=0.5 + 0.02 * i) for i in range(20)]
+            hand = SimpleNamespace(landmark=[*points, SimpleNamespace(x=1.01, y=0.5)])
+            side = SimpleNamespace(classification=[SimpleNamespace(label="Left", score=0.9)])
+            empty = image[0, 0, 0] == 10
+            return SimpleNamespace(
+                multi_hand_landmarks=None if empty else [hand], multi_handedness=None if empty else [side]
+            )
+
+    fake = SimpleNamespace(solutions=SimpleNamespace(hands=SimpleNamespace(Hands=Hands)))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(importlib, "import_module", lambda name: fake)
+    hands = detect_hands(frames, rig, progress=False)
+    assert asked == {
+        "static_image_mode": True,
+        "max_num_hands": 2,
+        "model_complexity": 1,
+        "min_detection_confidence": 0.5,
+    }
+    keypoints = hands.keypoints_px[1, SIDES.index("right"), 0]
+    np.testing.assert_allclose(keypoints[3], [0.28 * 64, 0.56 * 48])
+    assert np.isnan(keypoints[20]).all()
+    assert np.isfinite(hands.keypoints_px).all((-1, -2)).sum() == 0
+    assert np.isfinite(hands.boxes_px).all(-1).sum() == 1
 
 
 def test_no_hand_at_all_is_an_error(capture):

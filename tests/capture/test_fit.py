@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
-from poem_jax.capture.fit import fit, hands_of, read_keypoint_take
+from poem_jax.capture.fit import fit, hands_of, ideal_keypoints, read_keypoint_take
+from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.keypoint_agreement import epipolar_distances_px
 from poem_jax.capture.rig_file import write_rig
 from poem_jax.capture.take import Take
 from poem_jax.cli import main
+from poem_jax.geometry.distortion import distort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
@@ -37,17 +39,19 @@ def take(truth) -> Take:
         tuple(f"cam_{view}" for view in range(VIEWS)),
         np.tile([1280, 720], (VIEWS, 1)),
         takes[0].K.astype(np.float64),
-        np.zeros((VIEWS, 5)),
+        np.array([[-0.3, 0.1, 1e-3, -2e-3, 0.02 * view] for view in range(VIEWS)]),
         takes[0].T.astype(np.float64),
     )
-    return with_keypoints(rig, np.stack([t.uv_px for t in takes], 1).astype(np.float64))
+    ideal = np.stack([t.uv_px for t in takes], 1).astype(np.float64)
+    raw = [
+        distort_pixels(ideal[:, :, view].reshape(-1, 2), rig.K[view], rig.dist[view]) for view in range(VIEWS)
+    ]
+    return with_keypoints(rig, np.stack([x.reshape(FRAMES, 2, 21, 2) for x in raw], 2))
 
 
 def with_keypoints(rig: Rig, keypoints: np.ndarray, sides=SIDES, confidence=None) -> Take:
     frames = tuple(f"{frame:04d}" for frame in range(len(keypoints)))
     hands = HandBoxes(boxes_from_keypoints(keypoints), sides, frames, keypoints, confidence)
-    from poem_jax.capture.folder import FramePaths
-
     return Take(rig, [FramePaths(name, (None,) * rig.num_views) for name in frames], hands)
 
 
@@ -94,6 +98,7 @@ def test_one_bad_frame_is_marked(take, fitted, tmp_path, truth):
     keypoints = take.hands.keypoints_px.copy()
     keypoints[2, 0] = np.nan
     written = fit(changed(take, keypoints_px=keypoints), tmp_path, progress=False)
+    assert written.report["failed_frames"] == 0, "the other hand was found"
     lost = written.report["frames"][2]["hands"][0]
     assert not lost["valid"]
     assert "two views" in lost["reason"]
@@ -153,7 +158,9 @@ def test_a_turned_camera_is_named(take, tmp_path, caplog):
     T[2, :3] = rotation_from_axis_angle(np.array([0.05, 0.05, 0.0])) @ T[2, :3]
     with caplog.at_level(logging.WARNING):
         written = fit(take._replace(rig=take.rig._replace(T_cam_from_world=T)), tmp_path, progress=False)
-    (said,) = [r.getMessage() for r in caplog.records if "do not fit together" in r.getMessage()]
+    said = written.report["warnings"][0]
+    assert said in caplog.text
+    assert "do not fit together" in said
     assert said.count("'cam_2'") >= 2
     others = ["'cam_0' and 'cam_1'", "'cam_0' and 'cam_3'", "'cam_1' and 'cam_3'"]
     assert not any(pair in said for pair in others)
@@ -167,7 +174,8 @@ def test_a_right_rig_is_not_complained_about(take, tmp_path, caplog):
 
 
 def test_epipolar_distances_are_the_noise(take):
-    distances = epipolar_distances_px(take.rig, take.hands.keypoints_px)
+    ideal = ideal_keypoints(take.rig, take.hands.keypoints_px)
+    distances = epipolar_distances_px(take.rig, ideal)
     off_diagonal = ~np.eye(VIEWS, dtype=bool)
     assert np.isnan(np.diag(distances)).all()
     # The median of |N(0, 0.5 px)|.
@@ -244,6 +252,45 @@ def test_images_of_other_frames_are_refused(files, tmp_path):
         (images / "frames" / frame).rename(images / "frames" / f"take2_{frame}")
     with pytest.raises(ValueError, match="no frame of it"):
         read_keypoint_take(keypoints, rig, images)
+
+
+def test_points_beyond_the_fold_of_a_lens_are_dropped(take):
+    keypoints = take.hands.keypoints_px.copy()
+    keypoints[0, 0, 0, 0] = 2e4, 1e4
+    ideal = ideal_keypoints(take.rig, keypoints)
+    assert np.isnan(ideal[0, 0, 0, 0]).all()
+    assert np.isnan(ideal).sum() == 2
+
+
+def test_hands_outside_their_image_are_not_fitted(files, take, tmp_path, caplog):
+    keypoints = take.hands.keypoints_px.copy()
+    keypoints[1, 0, 2, :, 0] -= 5000
+    moved = write_boxes(
+        tmp_path / "moved.npz",
+        take.hands._replace(keypoints_px=keypoints, boxes_px=boxes_from_keypoints(keypoints)),
+    )
+    found = read_keypoint_take(moved, files[1])
+    assert np.isnan(found.hands.keypoints_px[1, 0, 2]).all()
+    assert "outside" in caplog.text
+
+
+def test_options_of_the_command(files, fitted, tmp_path):
+    """The shipped hand as the user's own file gives the same hands."""
+    keypoints, rig, _ = files
+    hand = default_hand()._asdict()
+    fields = {"f" if name == "faces" else name: value for name, value in hand.items() if name != "is_left"}
+    np.savez(tmp_path / "hand.npz", **fields)
+    command = ["fit", str(keypoints), "--rig", str(rig), "--out"]
+    assert main([*command, str(tmp_path / "own"), "--mano", str(tmp_path / "hand.npz")]) == 0
+    own = np.load(tmp_path / "own" / "prediction.npz")
+    np.testing.assert_allclose(own["vertices_world"], fitted.arrays["vertices_world"], atol=1e-4)
+    assert main([*command, str(tmp_path / "none"), "--mano", str(tmp_path / "missing.pkl")]) == 2
+
+
+def test_a_file_without_frames_is_refused(files, take, tmp_path):
+    empty = HandBoxes(np.zeros((0, 2, VIEWS, 4)), SIDES, (), np.zeros((0, 2, VIEWS, 21, 2)))
+    with pytest.raises(ValueError, match="at least one frame"):
+        read_keypoint_take(write_boxes(tmp_path / "empty.npz", empty), files[1])
 
 
 def test_a_left_model_serves_right_hands():

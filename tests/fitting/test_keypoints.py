@@ -61,6 +61,43 @@ def test_what_is_masked_changes_nothing(takes, how):
     np.testing.assert_allclose(found.sigma_m, three.sigma_m, rtol=1e-3)
 
 
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_the_scale_of_confidences_does_not_matter(takes, scale):
+    take = takes(3, 4, 2.0, 4, outliers=0.1)
+    confidence = np.random.default_rng(0).uniform(0.3, 1, take.uv_px.shape[:-1]).astype(np.float32)
+    one, other = (
+        robust(take.uv_px, take.K, take.T, confidence=c, take_axis=0)
+        for c in (confidence, np.float32(scale) * confidence)
+    )
+    np.testing.assert_array_equal(one.inlier_mask, other.inlier_mask)
+    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
+    np.testing.assert_allclose(one.sigma_m, other.sigma_m, rtol=1e-4)
+
+
+def test_sigma_is_calibrated_where_the_noise_differs(takes):
+    """Confidence is inverse variance: points of a quarter of it are twice as noisy."""
+    take = takes(60, 4, 0.0, 8)
+    rng = np.random.default_rng(1)
+    confidence = rng.choice([0.25, 1.0], take.uv_px.shape[:-1]).astype(np.float32)
+    noise = rng.normal(size=take.uv_px.shape) / np.sqrt(confidence)[..., None]
+    found = robust(
+        (take.uv_px + noise).astype(np.float32), take.K, take.T, confidence=confidence, take_axis=0
+    )
+    inside = np.abs(found.points - take.joints) < found.sigma_m[..., None]
+    assert 0.60 < inside[np.asarray(found.valid)].mean() < 0.76
+    assert found.inlier_mask.mean() > 0.99
+
+
+def test_a_camera_that_is_not_known_changes_nothing(takes):
+    take = takes(3, 4, 1.0, 4)
+    K, T = take.K.copy(), take.T.copy()
+    K[1], T[1] = np.nan, np.nan
+    found = robust(take.uv_px, K, T, take_axis=0)
+    others = robust(take.uv_px[:, [0, 2, 3]], take.K[[0, 2, 3]], take.T[[0, 2, 3]], take_axis=0)
+    np.testing.assert_allclose(found.points, others.points, atol=1e-6)
+    np.testing.assert_allclose(found.sigma_px, others.sigma_px, rtol=1e-5)
+
+
 def test_joints_seen_by_one_view_are_not_invented(takes):
     take = takes(3, 4, 1.0, 5)
     uv = take.uv_px.copy()

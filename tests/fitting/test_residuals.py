@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from poem_jax.fitting import anatomy, residuals
-from poem_jax.fitting.kinematics import pose_keypoints
+from poem_jax.fitting.kinematics import keypoint_model, pose_keypoints, pose_keypoints_of_rotations
 from poem_jax.hand.joint_limits import POSE_LIMITS
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import HandModel
@@ -109,10 +109,8 @@ def test_geman_mcclure(rng):
 
 def anatomy_of(model, quaternions, shape):
     rotations = anatomy.rotations_from_raw_quaternions(quaternions)
-    from poem_jax.fitting.kinematics import pose_keypoints_of_rotations
-
     posed = pose_keypoints_of_rotations(model, rotations, shape)
-    return anatomy.anatomy_terms(quaternions, shape, posed.rotations, posed.points)
+    return anatomy.anatomy_terms(quaternions, shape, posed.rotations, posed.points, model.hand.is_left)
 
 
 def test_anatomy_vanishes_for_the_flat_hand(model64):
@@ -139,6 +137,18 @@ def test_anatomy_punishes_what_it_says(model64):
     assert float(turned(axes.l, jnp.asarray(np.pi / 2 + 0.3)).angle) == pytest.approx(0.09 / 15, abs=1e-6)
 
 
+def test_a_left_hands_terms_are_those_of_its_mirror_image(model64, rng):
+    quaternions = np.tile([1.0, 0, 0, 0], (16, 1)) + 0.3 * rng.normal(size=(16, 4))
+    shape, mirror = rng.normal(size=10), np.diag([-1.0, 1, 1])
+    posed = pose_keypoints_of_rotations(
+        model64, anatomy.rotations_from_raw_quaternions(quaternions), jnp.asarray(shape)
+    )
+    left = anatomy.anatomy_terms(
+        quaternions * [1, 1, -1, -1], shape, mirror @ posed.rotations @ mirror, posed.points @ mirror, True
+    )
+    np.testing.assert_allclose(left, anatomy_of(model64, quaternions, shape), rtol=1e-9)
+
+
 def test_anatomy_gradients(model64, rng):
     quaternions = np.tile([1.0, 0, 0, 0], (16, 1)) + 0.3 * rng.normal(size=(16, 4))
     shape = jnp.asarray(rng.normal(size=10))
@@ -148,8 +158,6 @@ def test_anatomy_gradients(model64, rng):
 
 @pytest.mark.parity
 def test_anatomy_is_the_release(shared_dir):
-    from poem_jax.fitting.kinematics import keypoint_model
-
     # Tests in float32 that ran before leave index arrays converted for their precision in JAX's caches.
     jax.clear_caches()
     folder = shared_dir / "reference" / "poem_v1"

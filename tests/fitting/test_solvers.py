@@ -103,6 +103,36 @@ def test_one_bad_frame_does_not_stop_the_take(model, takes):
     assert error_mm(result, take).mean() < 1.5
 
 
+def test_the_first_frame_may_be_the_bad_one(model, takes):
+    take = takes(FRAMES, 4, 1.0, 13)
+    uv = take.uv_px.copy()
+    uv[0] = np.nan
+    result = shared(model, take._replace(uv_px=uv))
+    assert not result.valid[0]
+    np.testing.assert_array_equal(result.shape, np.tile(result.shape[:1], (FRAMES, 1)))
+    assert np.abs(result.shape[0]).max() > 0.1
+    assert error_mm(result, take).mean() < 1.5
+
+
+def test_one_wild_frame_does_not_hold_back_the_others(model, takes):
+    """The other hand's key points agree between the views, and no pose fits them."""
+    take, mirrored = takes(FRAMES, 4, 1.0, 13), takes(FRAMES, 4, 1.0, 13, hand=default_hand("left"))
+    uv = take.uv_px.copy()
+    uv[4] = mirrored.uv_px[4][:, ::-1]
+    errors = [error_mm(shared(model, take._replace(uv_px=k)), take) for k in (take.uv_px, uv)]
+    others = np.arange(FRAMES) != 4
+    assert np.median(errors[1][others]) < 1.2 * np.median(errors[0][others])
+
+
+def test_without_the_wrist_the_palm_still_finds_its_place(model, takes):
+    take = takes(FRAMES, 4, 0.5, 18)
+    uv = take.uv_px.copy()
+    uv[..., 0, :] = np.nan
+    errors = error_mm(shared(model, take._replace(uv_px=uv)), take)[:, 1:]
+    assert np.median(errors) < 1.5
+    assert np.mean(errors.max(-1) < 8) >= 0.9
+
+
 def test_all_views_masked(model, takes):
     take = takes(FRAMES, 4, 1.0, 13)
     result = shared(model, take, mask=np.zeros(take.uv_px.shape[:-1], bool))
