@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 import logging
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -102,7 +102,7 @@ def one_of_each_side(detections: Sequence[Detection]) -> dict[str, Detection]:
 
 def _overlap(a: Detection, b: Detection) -> bool:
     """Tell whether two detections are of one place: the boxes' intersection is over half of their union."""
-    boxes = boxes_from_keypoints(np.stack([a.keypoints_px, b.keypoints_px]))
+    boxes = np.asarray(boxes_from_keypoints(np.stack([a.keypoints_px, b.keypoints_px])))
     shared = np.clip(boxes[:, 2:].min(0) - boxes[:, :2].max(0), 0, None).prod()
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(-1)
     return bool(shared > _SAME_PLACE * (areas.sum() - shared))
@@ -128,14 +128,14 @@ def _mediapipe_detector() -> Callable[[UInt8[Array, "h w 3"]], Sequence[Detectio
     def detect(image: UInt8[Array, "h w 3"]) -> list[Detection]:
         height, width = image.shape[:2]
         found = hands.process(np.ascontiguousarray(image))
-        pairs = zip(found.multi_hand_landmarks or (), found.multi_handedness or (), strict=True)
-        return [
-            Detection(
-                _SIDE_OF_LABEL[sides.classification[0].label],
-                sides.classification[0].score,
-                _inside(np.array([[point.x, point.y] for point in hand.landmark])) * (width, height),
-            )
-            for hand, sides in pairs
-        ]
+        hand_landmarks: list[Any] = found.multi_hand_landmarks or []
+        handedness: list[Any] = found.multi_handedness or []
+        detections = []
+        for hand, sides in zip(hand_landmarks, handedness, strict=True):
+            named = sides.classification[0]
+            shares = np.array([[point.x, point.y] for point in hand.landmark])
+            keypoints = _inside(shares) * np.array([width, height])
+            detections.append(Detection(_SIDE_OF_LABEL[named.label], named.score, keypoints))
+        return detections
 
     return detect

@@ -143,7 +143,7 @@ def _check_any(take: Take, outcomes: list[FrameOutcome]) -> None:
 
 
 def _write_page(
-    path: Path, frames: list[PageFrame], cameras: list[PageCamera], faces: dict[str, Array]
+    path: Path, frames: list[PageFrame], cameras: list[PageCamera], faces: Mapping[str, Array]
 ) -> list[Path]:
     """Write the page if that can be done here; a warning says why not. The other results do not need it."""
     if not page_available():
