@@ -28,7 +28,8 @@ PALM_M = (0.04, 0.16)
 ADULT_PALM_M = 0.093
 
 _SUSPICIOUS_SHARE = 0.006
-"""Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise."""
+"""Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
+between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
 _LEAST_POINTS = 21
 _FITS_BETTER = 0.7
 _FITS_NOT = 4.0
