@@ -147,10 +147,12 @@ def test_paper(compare, micro_config):
     assert max(compare(micro_config)) < 1e-5
 
 
+@pytest.mark.parity
 def test_paper_hrnet(compare, hrnet_config):
     assert max(compare(hrnet_config)) < 1e-5
 
 
+@pytest.mark.parity
 def test_paper_parametric(compare, parametric_config):
     assert max(compare(parametric_config)) < 1e-5
 
@@ -159,6 +161,7 @@ def test_release(compare, micro_config):
     assert max(compare(_like_release(micro_config))) < 1e-5
 
 
+@pytest.mark.parity
 def test_release_parametric_of_one_view(compare, micro_config):
     config = _like_release(micro_config, DecoderOutput.HAND_PARAMETERS)
     assert max(compare(config, views=1)) < 1e-5

@@ -63,6 +63,7 @@ def test_two_and_two_steps_equal_four(micro_config, batch_at, tmp_path, caplog):
     assert (run / "git_commit.txt").read_text().strip()
 
 
+@pytest.mark.slow
 def test_a_run_in_sittings_passes_from_stage_to_stage_as_a_whole_one(
     micro_config, batch_at, tmp_path, caplog
 ):
