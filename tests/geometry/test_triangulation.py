@@ -95,7 +95,7 @@ def test_weights_pull_towards_their_views(look_at, cloud, rng, x64):
     trusting, _ = triangulate_jit(uv, cams.K, cams.T_cam_from_world, doubting)
     error = [np.linalg.norm(found - points, axis=-1).max() for found in (plain, trusting)]
     assert error[1] < 1e-2 * error[0]
-    half, _ = triangulate_jit(uv, cams.K, cams.T_cam_from_world, 0.5 * weights)
+    half, _ = triangulate_jit(uv, cams.K, cams.T_cam_from_world, 0.5 * doubting)
     np.testing.assert_allclose(half, trusting, atol=1e-12)
 
 
