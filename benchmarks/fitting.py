@@ -2,7 +2,8 @@
 
 `--figure FILE` draws the error over views and pixel noise instead (`pip install 'poem-jax[figures]'`).
 
-Own hand in natural poses, one unknown shape a take, cameras 1280 x 720 with f = 900 px, 0.7-1.2 m away. Both
+Own hand in natural poses, one unknown shape a take, cameras 1280 x 720 with f = 900 px in uniformly random
+directions 0.7-1.2 m away (`poem_jax/synthetic/keypoint_takes.py`). Both
 solvers see the same key points; neither uses a silhouette. The first call is stated apart; then the
 contestants take turns, and medians are reported. `adam-300` starts at the triangulated wrist with the flat
 hand, or, marked "same start", where `lm` starts.
@@ -14,12 +15,11 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from poem_jax.fitting.adam import AdamParameters
 from poem_jax.fitting.keypoints import triangulate_robust
@@ -27,82 +27,36 @@ from poem_jax.fitting.kinematics import keypoint_model
 from poem_jax.fitting.lm import LMConfig, ShapeMode
 from poem_jax.fitting.solvers import FitConfig, FitResult, fit_take, fit_take_adam
 from poem_jax.fitting.start import closed_form_pose
-from poem_jax.geometry.cameras import project
 from poem_jax.geometry.transforms import quaternion_from_rotation, rotation_from_axis_angle
 from poem_jax.geometry.triangulation import triangulate
-from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
-from poem_jax.synthetic.poses import sample_pose
+from poem_jax.synthetic.keypoint_takes import KeypointTake, draw_keypoint_take
 
-MODEL = keypoint_model(default_hand())
+HAND = default_hand()
+MODEL = keypoint_model(HAND)
 FIGURE_VIEWS = (2, 3, 4, 6, 8)
 FIGURE_NOISE_PX = (0.5, 1.0, 2.0, 4.0)
 
 
-class Take(NamedTuple):
-    """Key points of a take, and its truth in metres."""
-
-    uv_px: np.ndarray
-    K: np.ndarray
-    T: np.ndarray
-    shape: np.ndarray
-    joints: np.ndarray
-    vertices: np.ndarray
-
-
-def make_rig(rng: np.random.Generator, views: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return K and T_cam_from_world of cameras around and above the origin."""
-    azimuth = 2 * np.pi * np.arange(views) / views + rng.uniform(-0.2, 0.2, views)
-    height, distance = rng.uniform(0.2, 1.0, views), rng.uniform(0.7, 1.2, views)
-    ground = np.stack([np.cos(azimuth), np.sin(azimuth)], -1) * np.cos(height)[:, None]
-    centres = distance[:, None] * np.concatenate([ground, np.sin(height)[:, None]], -1)
-    forward = -centres / distance[:, None]
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    T = np.tile(np.eye(4), (views, 1, 1))
-    T[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:, :3, 3] = -np.einsum("vij,vj->vi", T[:, :3, :3], centres)
-    K = np.tile(np.array([[900, 0, 640], [0, 900, 360], [0, 0, 1.0]]), (views, 1, 1))
-    return K.astype(np.float32), T.astype(np.float32)
-
-
-def make_take(frames: int, views: int, noise_px: float, outliers: float, seed: int) -> Take:
-    """Draw a take; outliers lie 50 px off in any direction."""
-    rng = np.random.default_rng(seed)
-    pose = sample_pose(rng, frames)
-    pose[:, 0] = Rotation.random(frames, rng).as_rotvec()
-    shape = np.tile(rng.normal(size=10), (frames, 1))
-    place = rng.uniform(-0.08, 0.08, (frames, 3))
-    pose, shape, place = (x.astype(np.float32) for x in (pose, shape, place))
-    mesh = hand_mesh(default_hand(), pose, shape, place, center_joint=9)
-    K, T = make_rig(rng, views)
-    uv = project(K[None], T[None], mesh.joints[:, None])[0]
-    uv = uv + noise_px * rng.normal(size=uv.shape)
-    angle = rng.uniform(0, 2 * np.pi, uv.shape[:-1])
-    off = (rng.random(uv.shape[:-1]) < outliers)[..., None]
-    uv = uv + 50 * off * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return Take(uv.astype(np.float32), K, T, shape[0], mesh.joints, mesh.vertices)
-
-
-def error_mm(result: FitResult, take: Take, what: str = "joints") -> float:
+def error_mm(result: FitResult, take: KeypointTake, what: str = "joints") -> float:
     """Return the mean distance from the truth over the valid frames."""
     distance = np.linalg.norm(getattr(result, what) - getattr(take, what)[: len(result.valid)], axis=-1)
     return 1000 * float(distance[np.asarray(result.valid)].mean())
 
 
-def same_start(take: Take) -> AdamParameters:
+def same_start(take: KeypointTake) -> AdamParameters:
     """Return `lm`'s closed-form start as Adam's parameters."""
-    points = triangulate_robust(take.uv_px, take.K, take.T, take_axis=0)
+    points = triangulate_robust(take.uv_px, take.K, take.T_cam_from_world, take_axis=0)
     shape = jnp.zeros((len(take.uv_px), 10))
     pose, wrist = closed_form_pose(MODEL, points.points, points.valid, shape)
     return AdamParameters(quaternion_from_rotation(rotation_from_axis_angle(pose)), shape, wrist)
 
 
-def contestants(take: Take) -> dict[str, tuple[Callable[[], FitResult], int]]:
+def contestants(take: KeypointTake) -> dict[str, tuple[Callable[[], FitResult], int]]:
     """Return name -> (call, frames a call)."""
     lm, adam = jax.jit(partial(fit_take, MODEL)), jax.jit(partial(fit_take_adam, MODEL))
-    whole = (take.uv_px, take.K, take.T)
-    alone = (take.uv_px[:1], take.K, take.T)
+    whole = (take.uv_px, take.K, take.T_cam_from_world)
+    alone = (take.uv_px[:1], take.K, take.T_cam_from_world)
     begin = jax.jit(lambda uv: same_start(take._replace(uv_px=uv)))(take.uv_px)
     frames = len(take.uv_px)
     return {
@@ -123,7 +77,7 @@ def seconds(call: Callable[[], Any]) -> float:
 
 def time_table(frames: int, rounds: int) -> None:
     """Print ms a frame and joint error of every solver on 4 views of 2 px noise."""
-    take = make_take(frames, 4, 2.0, 0.0, seed=1)
+    take = draw_keypoint_take(HAND, frames, 4, 2.0, seed=1)
     entries = contestants(take)
     first = {name: seconds(call) for name, (call, _) in entries.items()}
     spent: dict[str, list[float]] = {name: [] for name in entries}
@@ -146,7 +100,10 @@ def error_table(frames: int, seeds: int) -> None:
         for mode in (ShapeMode.SHARED, ShapeMode.GIVEN):
             fit = jax.jit(partial(fit_take, MODEL, config=FitConfig(lm=LMConfig(shape_mode=mode))))
             for outliers in (0.0, 0.1):
-                takes = [make_take(frames, views, noise, outliers, seed) for seed in range(seeds)]
+                takes = [
+                    draw_keypoint_take(HAND, frames, views, noise, seed, outlier_share=outliers)
+                    for seed in range(seeds)
+                ]
                 row = np.mean([error_row(fit, take, mode) for take in takes], axis=0)
                 print(
                     f"| {views} | {noise:g} | {outliers:.0%} | {mode} | {row[0]:.2f} | {row[1]:.2f} |", end=""
@@ -155,12 +112,14 @@ def error_table(frames: int, seeds: int) -> None:
 
 
 def error_row(
-    fit: Callable[..., FitResult], take: Take, mode: ShapeMode
+    fit: Callable[..., FitResult], take: KeypointTake, mode: ShapeMode
 ) -> tuple[float, float, float, float]:
     """Return errors of DLT, joints and vertices in mm, and the share within one sigma."""
-    result = fit(take.uv_px, take.K, take.T, shape=take.shape if mode is ShapeMode.GIVEN else None)
+    result = fit(
+        take.uv_px, take.K, take.T_cam_from_world, shape=take.shape[0] if mode is ShapeMode.GIVEN else None
+    )
     frames = len(take.uv_px)
-    K, T = (np.broadcast_to(x, (frames, *x.shape)) for x in (take.K, take.T))
+    K, T = (np.broadcast_to(x, (frames, *x.shape)) for x in (take.K, take.T_cam_from_world))
     dlt = 1000 * np.linalg.norm(triangulate(take.uv_px, K, T)[0] - take.joints, axis=-1).mean()
     inside = np.abs(result.joints - take.joints) < np.asarray(result.sigma_m)[..., None]
     share = inside[np.asarray(result.valid)].mean()
@@ -174,7 +133,10 @@ def figure(path: Path, frames: int, seeds: int) -> None:
     print("| noise, px | " + " | ".join(f"{views} views" for views in FIGURE_VIEWS) + " |")
     print("|---" * (1 + len(FIGURE_VIEWS)) + "|")
     for noise in FIGURE_NOISE_PX:
-        takes = [[make_take(frames, views, noise, 0.0, s) for s in range(seeds)] for views in FIGURE_VIEWS]
+        takes = [
+            [draw_keypoint_take(HAND, frames, views, noise, seed) for seed in range(seeds)]
+            for views in FIGURE_VIEWS
+        ]
         means = [np.mean([error_row(fit, t, ShapeMode.SHARED)[:2] for t in many], 0) for many in takes]
         rows[noise] = np.array(means)
         cells = " | ".join(f"{fitted:.2f} ({dlt:.2f})" for dlt, fitted in means)

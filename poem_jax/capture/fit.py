@@ -32,7 +32,7 @@ from poem_jax.typing import Array, Float
 if TYPE_CHECKING:
     from poem_jax.fitting.solvers import FitConfig, FitResult
 
-NOT_FITTED = "fewer than three joints are seen by two views that agree on them"
+NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by two views that agree on them"
 
 _MISSED_PX = 0.5
 
@@ -127,10 +127,10 @@ def fit(
     _check_take(take)
     hands = hands_of(default_hand() if hand is None else hand)
     keypoints = ideal_keypoints(take.rig, take.hands.keypoints_px)
-    check_triangulation(take, keypoints)
+    check_triangulation(take.rig, keypoints)
     warnings = judge_pairs(take.rig, keypoints)
     clock.lap("triangulate_with_compilation")
-    config = fit_config(smooth)
+    config = fit_config(take.rig, smooth)
     results = []
     for index in range(len(take.hand_names)):
         fitted, said = _fit_hand(take, keypoints, hands, index, config)
@@ -146,12 +146,13 @@ def fit(
     return write_results(take, out, frames, faces, clock, about)
 
 
-def fit_config(smooth: bool) -> "FitConfig":
-    """Return the settings of a fit, with the second pass or without."""
+def fit_config(rig: Rig, smooth: bool) -> "FitConfig":
+    """Return the settings of a fit for images of the rig's size, with the second pass or without."""
+    from poem_jax.fitting.keypoints import KeypointNoise
     from poem_jax.fitting.smooth import SmoothConfig
     from poem_jax.fitting.solvers import FitConfig
 
-    return FitConfig(smooth=SmoothConfig() if smooth else None)
+    return FitConfig(noise=KeypointNoise.of_images(rig.size_wh), smooth=SmoothConfig() if smooth else None)
 
 
 def ideal_keypoints(
@@ -189,9 +190,10 @@ def _fit_hand(
     confidence = np.ones(keypoints[:, index].shape[:-1]) if confidence is None else confidence[:, index]
     evidence = (keypoints[:, index], confidence, take.rig, config)
     own = _run(hands.of(side), *evidence)
-    if not fits_badly(own):
+    if not fits_badly(own, config.noise):
         return own, []
-    return own, judge_fit(take.hand_names[index], own, _run(hands.other(side), *evidence))
+    other = _run(hands.other(side), *evidence)
+    return own, judge_fit(take.hand_names[index], own, other, config.noise)
 
 
 def _run(hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig") -> "FitResult":

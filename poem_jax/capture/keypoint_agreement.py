@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from poem_jax.capture.take import Take
 from poem_jax.geometry.camera_checks import INVERTED
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, skew_matrix
@@ -20,7 +19,7 @@ from poem_jax.hand.topology import ROOT_JOINT, WRIST
 from poem_jax.typing import Array, Float
 
 if TYPE_CHECKING:
-    from poem_jax.fitting.keypoints import RobustPoints
+    from poem_jax.fitting.keypoints import KeypointNoise, RobustPoints
     from poem_jax.fitting.solvers import FitResult
 
 PALM_M = (0.04, 0.16)
@@ -80,16 +79,16 @@ def judge_pairs(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) ->
     ]
 
 
-def check_triangulation(take: Take, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
+def check_triangulation(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
     """Raise if the key points cannot be triangulated, or give hands of an impossible size.
 
     Raises:
         ValueError: The extrinsics map camera to world; their unit is not what the rig says. The message
             says what one unit seems to be.
     """
-    points = _triangulated(take.rig, keypoints_px)
+    points = _triangulated(rig, keypoints_px)
     if _agreeing_share(points, keypoints_px) < _AGREEING[0]:
-        inverse = take.rig._replace(T_cam_from_world=invert_rigid(take.rig.T_cam_from_world))
+        inverse = rig._replace(T_cam_from_world=invert_rigid(rig.T_cam_from_world))
         if _agreeing_share(_triangulated(inverse, keypoints_px), keypoints_px) > _AGREEING[1]:
             raise ValueError(INVERTED)
     both = points.valid[..., WRIST] & points.valid[..., ROOT_JOINT]
@@ -106,18 +105,19 @@ def check_triangulation(take: Take, keypoints_px: Float[Array, "frame hand view 
         )
 
 
-def fits_badly(fitted: "FitResult", least_ratio: float = 2.0) -> bool:
+def fits_badly(fitted: "FitResult", noise: "KeypointNoise", least_ratio: float = 2.0) -> bool:
     """Tell whether a hand is further from its key points than their noise explains."""
-    return bool(_median_error(fitted) > least_ratio * _expected_error(fitted))
+    return bool(_median_error(fitted) > least_ratio * _expected_error(fitted, noise))
 
 
-def judge_fit(name: str, own: "FitResult", other: "FitResult") -> list[str]:
+def judge_fit(name: str, own: "FitResult", other: "FitResult", noise: "KeypointNoise") -> list[str]:
     """Return warnings: the hand is of the other side, or its key points are in another order.
 
     Args:
         name: Of the hand.
         own: The fit of the side that the file names.
         other: The fit of the opposite side.
+        noise: What was expected of the key points.
     """
     error, error_other = _median_error(own), _median_error(other)
     if error_other < _FITS_BETTER * error:
@@ -125,18 +125,18 @@ def judge_fit(name: str, own: "FitResult", other: "FitResult") -> list[str]:
             f"hand '{name}' seems to be of the other side: it fits the key points to {error:.1f} px, its "
             f"mirror image to {error_other:.1f} px; check `hand_side`"
         ]
-    if fits_badly(own, _FITS_NOT):
+    if fits_badly(own, noise, _FITS_NOT):
         return [
-            f"hand '{name}': the views agree with each other to {_expected_error(own):.1f} px, but no hand "
-            f"fits the key points better than {error:.1f} px; check that the joints are in OpenPose order "
-            "(wrist, then thumb to little finger, each from its base to its tip)"
+            f"hand '{name}': the views agree with each other to {_expected_error(own, noise):.1f} px, but no "
+            f"hand fits the key points better than {error:.1f} px; check that the joints are in OpenPose "
+            "order (wrist, then thumb to little finger, each from its base to its tip)"
         ]
     return []
 
 
-def _expected_error(fitted: "FitResult") -> float:
+def _expected_error(fitted: "FitResult", noise: "KeypointNoise") -> float:
     """Return the distance that the noise of the key points alone gives, pixels."""
-    return max(float(np.max(fitted.sigma_px)), 1.0) * np.sqrt(2)
+    return max(float(np.max(fitted.sigma_px)), noise.expected_px) * np.sqrt(2)
 
 
 def _agreeing_share(points: "RobustPoints", keypoints_px: Array) -> float:
@@ -156,14 +156,17 @@ def _triangulated(rig: Rig, keypoints_px: Array) -> "RobustPoints":
     """Triangulate (frame, hand, view, 21, 2), the noise estimated over the frames of each hand."""
     import jax
 
+    from poem_jax.fitting.keypoints import KeypointNoise
+
     arrays = (keypoints_px, rig.K, rig.T_cam_from_world)
-    return jax.device_get(_program()(*(np.asarray(array, np.float32) for array in arrays)))
+    program = _program(KeypointNoise.of_images(rig.size_wh))
+    return jax.device_get(program(*(np.asarray(array, np.float32) for array in arrays)))
 
 
 @functools.cache
-def _program():
+def _program(noise: "KeypointNoise"):
     import jax
 
     from poem_jax.fitting.keypoints import triangulate_robust
 
-    return jax.jit(functools.partial(triangulate_robust, take_axis=0))
+    return jax.jit(functools.partial(triangulate_robust, noise=noise, take_axis=0))

@@ -3,13 +3,15 @@
 The paper's recipe: 300 steps of Adam, step size 1e-2, halved when the loss has not improved for 50 steps. The
 released recipe differs: the shape has a step size of its own (1e-3); the gradient is clipped to norm 0.1 over
 all parameters; and it is never zeroed, so that every step adds the new gradient to the clipped previous one.
-Both minimise 1000 * key points + 50 * anatomy over 16 quaternions, shape and translation (the silhouette term
-is a part of neither here).
+Both minimise 1000 * key points + 50 * anatomy over 16 quaternions, shape and translation, and, where masks
+are given, 10 * silhouettes: the paper's cross-entropy, the release's L1. The weights are the release's; the
+paper states none.
 
 Written out instead of taken from optax: the accumulated gradient and the rule of the plateau, which must
 follow PyTorch's `ReduceLROnPlateau` step by step, are the recipe.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,10 +21,20 @@ import jax.numpy as jnp
 from poem_jax.fitting.anatomy import anatomy_loss, anatomy_terms, rotations_from_raw_quaternions
 from poem_jax.fitting.keypoints import projection_jacobian
 from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints_of_rotations
+from poem_jax.fitting.silhouette import (
+    Masks,
+    SilhouetteTarget,
+    silhouette_cross_entropy,
+    silhouette_l1,
+    silhouette_of_views,
+)
+from poem_jax.hand.topology import WRIST
+from poem_jax.render.soft import RELEASE_SIGMA
 from poem_jax.typing import Array, Float
 
 KEYPOINT_WEIGHT = 1000.0
 ANATOMY_WEIGHT = 50.0
+SILHOUETTE_WEIGHT = 10.0
 RELEASE_DIAGONAL_PX = 362.03867196751236
 """Diagonal of the release's 256 x 256 images."""
 
@@ -47,11 +59,15 @@ class AdamRecipe:
     """Bound of the gradient's norm over all parameters together."""
     accumulate: bool = False
     """Add each new gradient to the clipped previous one."""
+    silhouette_loss: Callable[[Array, Masks, Array], Array] = silhouette_cross_entropy
+    """Used where masks are given."""
+    silhouette_sigma: float = RELEASE_SIGMA
+    """Softness of the drawn outline, NDC squared; the paper states none."""
 
 
 ADAM_300 = AdamRecipe()
 """The paper's."""
-ADAM_300_RELEASE = AdamRecipe(shape_rate=1e-3, clip_norm=0.1, accumulate=True)
+ADAM_300_RELEASE = AdamRecipe(shape_rate=1e-3, clip_norm=0.1, accumulate=True, silhouette_loss=silhouette_l1)
 """The released code's."""
 
 
@@ -109,11 +125,13 @@ def fitting_loss(
     K: Float[Array, "view 3 3"],
     T_cam_from_world: Float[Array, "view 4 4"],
     diagonal_px: float | Array = RELEASE_DIAGONAL_PX,
+    silhouettes: SilhouetteTarget | None = None,
+    recipe: AdamRecipe = ADAM_300,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return 1000 * key points + 50 * anatomy of one frame, and the key-point term alone.
+    """Return 1000 * key points + 50 * anatomy (+ 10 * silhouettes) of a frame, and the key-point term alone.
 
     Key points: mean over views and joints of confidence * |projected - observed|^2 / diagonal^2; pixels with
-    weight zero must be finite.
+    weight zero must be finite. Of `recipe` only what it says of silhouettes is used.
     """
     rotations = rotations_from_raw_quaternions(parameters.quaternions)
     posed = pose_keypoints_of_rotations(model, rotations, parameters.shape)
@@ -125,7 +143,15 @@ def fitting_loss(
             parameters.quaternions, parameters.shape, posed.rotations, posed.points, model.hand.is_left
         )
     )
-    return KEYPOINT_WEIGHT * keypoints + ANATOMY_WEIGHT * anatomy, keypoints
+    loss = KEYPOINT_WEIGHT * keypoints + ANATOMY_WEIGHT * anatomy
+    if silhouettes is not None:
+        mesh = model.hand.shape(parameters.shape).pose_rotations(rotations).skin()
+        vertices = mesh.vertices - mesh.joints[WRIST] + parameters.translation
+        outline = silhouette_of_views(
+            vertices, model.hand.faces, silhouettes, recipe.silhouette_loss, sigma=recipe.silhouette_sigma
+        )
+        loss = loss + SILHOUETTE_WEIGHT * outline
+    return loss, keypoints
 
 
 def adam_fit(
@@ -138,6 +164,7 @@ def adam_fit(
     recipe: AdamRecipe = ADAM_300,
     *,
     diagonal_px: float | Array = RELEASE_DIAGONAL_PX,
+    silhouettes: SilhouetteTarget | None = None,
     trace: bool = False,
 ) -> tuple[AdamParameters, AdamTrace | None]:
     """Fit one frame; map it over frames with `jax.vmap`.
@@ -147,11 +174,13 @@ def adam_fit(
         start: where to begin, see `released_start`.
         recipe: static.
         diagonal_px: the unit of the key-point term, the images' diagonal.
+        silhouettes: masks (view, h, w) and their cameras; None leaves the term out.
         trace: return what happened at every step as well.
     """
 
     def loss(parameters: AdamParameters) -> tuple[Array, Array]:
-        return fitting_loss(parameters, model, uv_px, weights, K, T_cam_from_world, diagonal_px)
+        observed = (uv_px, weights, K, T_cam_from_world, diagonal_px)
+        return fitting_loss(parameters, model, *observed, silhouettes, recipe)
 
     def step(state: _State, _: None) -> tuple[_State, AdamTrace | None]:
         (value, keypoints), gradient = jax.value_and_grad(loss, has_aux=True)(state.parameters)

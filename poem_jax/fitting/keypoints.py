@@ -10,6 +10,8 @@ one coordinate of a key point of confidence 1 (px), estimated from the residuals
 scaled inverse chi-square prior. The covariance of a joint is s^2 (sum_v w J_v^T J_v)^-1.
 """
 
+import math
+from dataclasses import dataclass, fields
 from itertools import combinations
 from typing import NamedTuple
 
@@ -20,22 +22,38 @@ import numpy as np
 from poem_jax.geometry.cameras import normalised_from_pixels, project
 from poem_jax.geometry.transforms import invert_rigid, rotate_points, transform_points
 from poem_jax.geometry.triangulation import triangulate
-from poem_jax.typing import Array, Bool, Float
+from poem_jax.typing import Array, Bool, Float, Num
 
-GATE_PX = 20.0
-"""A view further off than this never agrees with a proposal, pixels."""
-GATE_SIGMAS = 4.5
-"""Nor one further off than this many times the noise, once the noise is known."""
-PRIOR_SIGMA_PX = 1.5
-PRIOR_COUNT = 20.0
-"""The noise is as if this many residuals of PRIOR_SIGMA_PX had been seen before."""
-MIN_SIGMA_PX = 0.1
+REFERENCE_DIAGONAL_PX = math.hypot(1280, 720)
+"""Of the images that defaults in pixels are meant for."""
 
 _STEPS = 4
 _FEWEST_VIEWS = 2
 _DAMPING = 1e-6
 _PARALLEL = 1e-7
 """Squared sine of the angle between two rays below which they count as parallel."""
+_GATE_SIGMAS = 4.5
+"""A view further off than this many times the noise never agrees, once the noise is known."""
+_EXPECTED_COUNT = 20.0
+"""The noise is as if this many residuals of the expected size had been seen before."""
+
+
+@dataclass(frozen=True)
+class KeypointNoise:
+    """What to expect of the key points, in pixels; the defaults suit images of 1280 x 720."""
+
+    gate_px: float = 20.0
+    """A view further off than this from where the others see a joint is an outlier."""
+    expected_px: float = 1.5
+    """Noise of one coordinate, before any was seen."""
+    least_px: float = 0.3
+    """Nobody is taken to be better than this."""
+
+    @classmethod
+    def of_images(cls, size_wh: Num[Array, "*view 2"]) -> "KeypointNoise":
+        """Scale the defaults to images of this size (of several cameras: their mean diagonal)."""
+        scale = float(np.mean(np.linalg.norm(np.asarray(size_wh, float), axis=-1))) / REFERENCE_DIAGONAL_PX
+        return cls(*(scale * getattr(cls(), field.name) for field in fields(cls)))
 
 
 class RobustPoints(NamedTuple):
@@ -62,7 +80,7 @@ def triangulate_robust(
     confidence: Float[Array, "..."] | None = None,
     mask: Bool[Array, "..."] | None = None,
     *,
-    gate_px: float = GATE_PX,
+    noise: KeypointNoise = KeypointNoise(),
     take_axis: int | None = None,
 ) -> RobustPoints:
     """Triangulate joints from the views that agree with each other.
@@ -74,7 +92,7 @@ def triangulate_robust(
         confidence: inverse variance of each key point (*batch, view, joint), on any scale; zero, negative or
             NaN means "ignore".
         mask: (*batch, view, joint); False means "ignore", whatever the other arguments hold there.
-        gate_px: views further off than this are outliers.
+        noise: what to expect of the key points; static under `jax.jit`.
         take_axis: batch axis (say, of frames) over which the noise is estimated together; None estimates it
             for each batch entry from its own joints.
 
@@ -85,14 +103,14 @@ def triangulate_robust(
         ValueError: fewer than two views, or key points and cameras of different numbers of views.
     """
     uv, weights, K, T = _clean_inputs(uv_px, K, T_cam_from_world, confidence, mask, take_axis)
-    start, inliers = _vote(uv, weights, K, T, gate_px)
+    start, inliers = _vote(uv, weights, K, T, noise.gate_px)
     points = _refine(start, uv, weights * inliers, K, T)
-    sigma = _noise(points, uv, weights * inliers, K, T, take_axis)
-    inliers = _agreeing(points, uv, weights, K, T, GATE_SIGMAS * sigma, gate_px)
+    sigma = _estimate_noise(points, uv, weights * inliers, K, T, take_axis, noise)
+    inliers = _agreeing(points, uv, weights, K, T, _GATE_SIGMAS * sigma, noise.gate_px)
     inliers = inliers & (jnp.sum(inliers, -2, keepdims=True) >= _FEWEST_VIEWS)
     used = weights * inliers
     points = _refine(points, uv, used, K, T)
-    sigma = _noise(points, uv, used, K, T, take_axis)
+    sigma = _estimate_noise(points, uv, used, K, T, take_axis, noise)
     return _with_uncertainty(points, uv, used, K, T, sigma)
 
 
@@ -149,7 +167,9 @@ def _clean_inputs(
 
 
 def finite_cameras(
-    K: Float[Array, "..."], T_cam_from_world: Float[Array, "..."], batch: tuple[int, ...]
+    K: Float[Array, "*#batch view 3 3"],
+    T_cam_from_world: Float[Array, "*#batch view 4 4"],
+    batch: tuple[int, ...],
 ) -> tuple[Float[Array, "*batch view 3 3"], Float[Array, "*batch view 4 4"], Bool[Array, "*batch view"]]:
     """Broadcast cameras over `batch`; those that are not finite become identities and are not known."""
     K, T = (jnp.broadcast_to(x, (*batch, *x.shape[-3:])) for x in map(jnp.asarray, (K, T_cam_from_world)))
@@ -276,8 +296,14 @@ def _inverse(H: Array, solvable: Array) -> Float[Array, "*batch joint 3 3"]:
     return adjugate / jnp.maximum(determinant, _DAMPING**2) / scale
 
 
-def _noise(
-    points: Array, uv: Array, weights: Array, K: Array, T: Array, take_axis: int | None
+def _estimate_noise(
+    points: Array,
+    uv: Array,
+    weights: Array,
+    K: Array,
+    T: Array,
+    take_axis: int | None,
+    noise: KeypointNoise,
 ) -> Float[Array, "*batch"]:
     """Estimate the noise of one coordinate from residuals, 2 v - 3 degrees of freedom per joint."""
     count = jnp.sum(weights > 0, axis=-2)
@@ -287,8 +313,8 @@ def _noise(
     freedom = jnp.sum(jnp.where(counted, 2 * count - 3, 0), axis=-1).astype(square.dtype)
     if take_axis is not None:
         square, freedom = (jnp.sum(x, take_axis, keepdims=True) + 0 * x for x in (square, freedom))
-    variance = (PRIOR_COUNT * PRIOR_SIGMA_PX**2 + square) / (PRIOR_COUNT + freedom)
-    return jnp.maximum(jnp.sqrt(variance), MIN_SIGMA_PX)
+    variance = (_EXPECTED_COUNT * noise.expected_px**2 + square) / (_EXPECTED_COUNT + freedom)
+    return jnp.maximum(jnp.sqrt(variance), noise.least_px)
 
 
 def _with_uncertainty(

@@ -71,8 +71,8 @@ class LMConfig:
     """Where the robust kernel cuts off, in standard deviations of a key point."""
     first_robust_sigmas: float = 50.0
     """The same at the first iteration; it falls to `robust_sigmas` over the first half."""
-    prior_weight: float = 1.0
-    """Of the pose prior; 1 takes it as a normal distribution."""
+    prior_weight: float = 0.5
+    """Of the pose prior; 1 takes half of each joint's range as a standard deviation."""
     limit_sigma: float = LIMIT_SIGMA
     """Radians; how softly joints are stopped beyond their limits."""
     least_prior_sigma: float = LEAST_PRIOR_SIGMA
@@ -128,19 +128,36 @@ def solve(model: KeypointModel, take: TakeObservations, start: TakeState, config
 def joint_sigma(
     model: KeypointModel, take: TakeObservations, state: TakeState, config: LMConfig
 ) -> Float[Array, "frame 21"]:
-    """Return the standard deviation of one coordinate of every joint, metres, from the posterior at `state`.
-
-    sqrt(trace / 3) of D H^-1 D^T, plus what the shape's own uncertainty adds where it is estimated.
-    """
+    """Return the standard deviation of one coordinate of every joint, metres, given all observations."""
     equations = normal_equations(model, take, state, config.robust_sigmas, config)
     factor = _factor(equations.H, jnp.full_like(take.frame_mask, _LEAST_DAMPING, state.pose.dtype))
+    eye = jnp.broadcast_to(jnp.eye(STATE_SIZE, dtype=equations.H.dtype), equations.H.shape)
+    solved = _solve(factor, jnp.concatenate([eye, equations.H_shape], axis=-1))
+    return posterior_sigma(equations, solved[..., :STATE_SIZE], solved[..., STATE_SIZE:], take, state, config)
+
+
+def posterior_sigma(
+    equations: NormalEquations,
+    covariance: Float[Array, "frame 51 51"],
+    solved: Float[Array, "frame 51 10"],
+    take: TakeObservations,
+    state: TakeState,
+    config: LMConfig,
+) -> Float[Array, "frame 21"]:
+    """Return the standard deviation of one coordinate of every joint, metres.
+
+    sqrt(trace / 3) of D C D^T, plus what the shape's own uncertainty adds where it is estimated.
+
+    Args:
+        equations: at `state`.
+        covariance: C, of x given the shape.
+        solved: C H_shape over all frames together, by how much x follows the shape.
+    """
     D = equations.D.reshape(-1, NUM_JOINTS * 3, STATE_SIZE)
-    spread = _solve(factor, jnp.swapaxes(D, -1, -2))
-    variance = jnp.sum(D * jnp.swapaxes(spread, -1, -2), axis=-1)
+    variance = jnp.sum(matmul(D, covariance) * D, axis=-1)
     if config.shape_mode is not ShapeMode.GIVEN:
-        schur, _ = _reduced_shape(equations, _solve(factor, equations.H_shape), None, take, state, config)
-        D_shape = equations.D_shape.reshape(-1, NUM_JOINTS * 3, NUM_SHAPES)
-        moved = D_shape - matmul(jnp.swapaxes(spread, -1, -2), equations.H_shape)
+        schur, _ = _reduced_shape(equations, solved, None, take, state, config)
+        moved = equations.D_shape.reshape(-1, NUM_JOINTS * 3, NUM_SHAPES) - matmul(D, solved)
         variance = variance + jnp.sum(moved * matmul(moved, jnp.linalg.inv(schur)), axis=-1)
     variance = variance.reshape(-1, NUM_JOINTS, 3)
     return jnp.sqrt(jnp.maximum(jnp.mean(variance, axis=-1), 0))

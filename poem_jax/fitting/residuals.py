@@ -11,8 +11,8 @@ from poem_jax.fitting.keypoints import projection_jacobian
 from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, rotation_from_axis_angle, transpose
 from poem_jax.typing import Array, Bool, Float
 
-LIMIT_SIGMA = 0.05
-"""Radians. How softly a joint is stopped beyond its limit."""
+LIMIT_SIGMA = 0.2
+"""Radians. How softly a joint is stopped beyond its limit: people differ by about this much (11 degrees)."""
 LEAST_PRIOR_SIGMA = 0.05
 """Radians. No angle is held tighter than this by the pose prior, however narrow its limits."""
 

@@ -10,7 +10,8 @@ Every loss is a mean over the valid views and all pixels, one number per batch e
 valid. Masked views may hold anything, NaN included: they change neither a loss nor a gradient.
 """
 
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 
@@ -23,6 +24,34 @@ Masks: TypeAlias = Num[Array, "*batch view mask_h mask_w"] | Bool[Array, "*batch
 
 LOG_FLOOR = -100.0
 """Smallest logarithm in the cross-entropy, as in PyTorch's `binary_cross_entropy`."""
+
+
+class SilhouetteTarget(NamedTuple):
+    """What was seen of a hand, for `silhouette_of_views`."""
+
+    masks: Masks
+    cams: Cameras
+    """The views; `K` counts pixels of the masks themselves (`geometry.cameras.resize_intrinsics`)."""
+
+
+def silhouette_of_views(
+    vertices_world: Float[Array, "*batch vert 3"],
+    faces: Int[Array, "face 3"],
+    target: SilhouetteTarget,
+    loss: Callable[[Array, Masks, Array], Array],
+    *,
+    sigma: float = RELEASE_SIGMA,
+) -> Float[Array, "*batch"]:
+    """Return `loss` (`silhouette_l1` or `silhouette_cross_entropy`) of a mesh, metres, against masks.
+
+    The blur radius is the release's multiple of `sigma`.
+    """
+    size = target.masks.shape[-2:]
+    blur_radius = RELEASE_BLUR_RADIUS / RELEASE_SIGMA * sigma
+    coverage = view_coverage(
+        vertices_world, faces, target.cams, size, size, sigma=sigma, blur_radius=blur_radius
+    )
+    return loss(coverage, target.masks, target.cams.view_mask)
 
 
 def view_coverage(

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
 from poem_jax.fitting.anatomy import rotations_from_raw_quaternions
 from poem_jax.fitting.keypoints import (
+    REFERENCE_DIAGONAL_PX,
+    KeypointNoise,
     RobustPoints,
     finite_cameras,
     projection_jacobian,
@@ -24,8 +26,9 @@ from poem_jax.fitting.keypoints import (
 )
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
 from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState, joint_sigma, solve
-from poem_jax.fitting.smooth import SmoothConfig, smooth
-from poem_jax.fitting.start import FEWEST_JOINTS, closed_form_pose
+from poem_jax.fitting.silhouette import SilhouetteTarget
+from poem_jax.fitting.smooth import SmoothConfig, smooth, smoothed_sigma
+from poem_jax.fitting.start import can_be_placed, closed_form_pose
 from poem_jax.geometry.transforms import axis_angle_from_rotation
 from poem_jax.hand.model import HandModel, hand_mesh
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, WRIST
@@ -33,17 +36,14 @@ from poem_jax.typing import Array, Bool, Float
 
 __all__ = ["FitConfig", "FitResult", "HandModel", "fit_take", "fit_take_adam", "keypoint_model"]
 
-_LEAST_SIGMA_PX = 0.3
-"""Key points count as at least this noisy: float32 and the hand model are no better."""
-
 
 @dataclass(frozen=True)
 class FitConfig:
     """Static settings of `fit_take`."""
 
     lm: LMConfig = field(default_factory=LMConfig)
-    gate_px: float = 20.0
-    """A view further off than this from where the others see a joint is an outlier, pixels."""
+    noise: KeypointNoise = field(default_factory=KeypointNoise)
+    """What to expect of the key points: `KeypointNoise.of_images(size_wh)` for images of another size."""
     smooth: SmoothConfig | None = None
     """A second pass over the whole take; None leaves it out."""
 
@@ -60,7 +60,7 @@ class FitResult(NamedTuple):
     joints: Float[Array, "frame 21 3"]
     vertices: Float[Array, "frame 778 3"]
     valid: Bool[Array, "frame"]
-    """True where at least two views gave three or more joints."""
+    """True where at least two views gave three or more joints that do not lie on one line."""
     reprojection_px: Float[Array, "frame view"]
     """Mean distance of the fitted joints from the finite, unmasked key points, outliers included; NaN where
     a view has none."""
@@ -84,6 +84,8 @@ def fit_take(
 ) -> FitResult:
     """Fit one hand to all frames of a take.
 
+    Shapes are checked here, so that a wrong one is told in words.
+
     Args:
         model: `keypoint_model(hand)` of the hand's own side.
         keypoints_px: (frame, view, 21, 2) OpenPose order; NaN = unseen.
@@ -97,13 +99,16 @@ def fit_take(
     Raises:
         ValueError: fewer than two views; key points, cameras and shape that do not belong together.
     """
-    _check(keypoints_px, K, T_cam_from_world, shape, config)
-    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config)
+    given = config.lm.shape_mode is ShapeMode.GIVEN
+    _check(keypoints_px, K, T_cam_from_world, confidence, mask, shape, given)
+    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config.noise)
     start = _start(model, points, take, shape)
     state = solve(model, take, start, config.lm)
-    if config.smooth is not None:
+    if config.smooth is None:
+        sigma = joint_sigma(model, take, state, config.lm)
+    else:
         state = smooth(model, take, state, config.lm, config.smooth)
-    sigma = joint_sigma(model, take, state, config.lm)
+        sigma = smoothed_sigma(model, take, state, config.lm, config.smooth)
     return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px)
 
 
@@ -117,7 +122,9 @@ def fit_take_adam(
     start: AdamParameters | None = None,
     recipe: AdamRecipe = ADAM_300,
     *,
-    diagonal_px: float = 1468.6,
+    config: FitConfig = FitConfig(),
+    diagonal_px: float = REFERENCE_DIAGONAL_PX,
+    silhouettes: SilhouetteTarget | None = None,
 ) -> FitResult:
     """Fit one hand by the paper's iterative optimisation, every frame by itself; arguments as `fit_take`.
 
@@ -125,60 +132,76 @@ def fit_take_adam(
         start: parameters with a leading axis of frames; None begins with the flat hand, unturned, at the
             triangulated wrist.
         recipe: static.
+        config: its `noise` is used; static.
         diagonal_px: diagonal of the images; the default is that of 1280 x 720.
+        silhouettes: masks (frame, view, h, w) and their cameras with a leading axis of frames, a term of its
+            own; frames are then fitted one after the other, for drawing them takes memory.
 
     Returns: as `fit_take`, with `sigma_m` zero: this solver has no uncertainty.
     """
-    config = FitConfig()
-    _check(keypoints_px, K, T_cam_from_world, None, config)
-    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config)
+    _check(keypoints_px, K, T_cam_from_world, confidence, mask, None, given=False)
+    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config.noise)
     usable = take.weights > 0
     weights = usable.astype(take.weights.dtype) if confidence is None else jnp.where(usable, confidence, 0)
     if start is None:
         start = jax.vmap(lambda wrist: released_start(None, wrist))(points.points[:, WRIST])
 
-    def one(uv: Array, w: Array, K: Array, T: Array, begin: AdamParameters) -> AdamParameters:
-        return adam_fit(model, uv, w, K, T, begin, recipe, diagonal_px=diagonal_px)[0]
+    def one(frame: tuple) -> AdamParameters:
+        uv, w, K, T, begin, masks = frame
+        found, _ = adam_fit(model, uv, w, K, T, begin, recipe, diagonal_px=diagonal_px, silhouettes=masks)
+        return found
 
-    found = jax.vmap(one)(take.uv_px, weights, take.K, take.T_cam_from_world, start)
+    frames = (take.uv_px, weights, take.K, take.T_cam_from_world, start, silhouettes)
+    found = jax.vmap(one)(frames) if silhouettes is None else jax.lax.map(one, frames)
     pose = axis_angle_from_rotation(rotations_from_raw_quaternions(found.quaternions))
     state = TakeState(pose, found.translation, found.shape)
     sigma = jnp.zeros((*pose.shape[:1], NUM_JOINTS))
     return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px)
 
 
-def _check(uv: Array, K: Array, T: Array, shape: Array | None, config: FitConfig) -> None:
+def _check(
+    uv: Array,
+    K: Array,
+    T: Array,
+    confidence: Array | None,
+    mask: Array | None,
+    shape: Array | None,
+    given: bool,
+) -> None:
     if uv.ndim != 4 or uv.shape[-2:] != (NUM_JOINTS, 2):
         raise ValueError(f"`keypoints_px` must have shape (frame, view, 21, 2); got {uv.shape}")
-    if uv.shape[1] < 2:
+    frames, views = uv.shape[:2]
+    if views < 2:
         raise ValueError(f"a fit needs at least two views; got `keypoints_px` of shape {uv.shape}")
-    if K.shape[-3] != uv.shape[1] or T.shape[-3] != uv.shape[1]:
-        raise ValueError(
-            f"key points and cameras must have the same views; got {uv.shape[1]} views of key points, "
-            f"K of shape {K.shape}, T_cam_from_world of shape {T.shape}"
-        )
-    given = config.lm.shape_mode is ShapeMode.GIVEN
+    for name, cameras, size in (("K", K, 3), ("T_cam_from_world", T, 4)):
+        if cameras.shape not in ((views, size, size), (frames, views, size, size)):
+            raise ValueError(
+                f"key points and cameras must have the same views: `{name}` must have shape "
+                f"({views}, {size}, {size}), or ({frames}, {views}, {size}, {size}); got {cameras.shape}"
+            )
+    for name, array in (("confidence", confidence), ("mask", mask)):
+        if array is not None and array.shape != uv.shape[:-1]:
+            raise ValueError(f"`{name}` must have shape {uv.shape[:-1]}; got {array.shape}")
     if given != (shape is not None):
-        raise ValueError(
-            f"`shape` goes with ShapeMode.GIVEN only; got {config.lm.shape_mode!r} and shape {shape}"
-        )
+        raise ValueError(f"`shape` goes with ShapeMode.GIVEN, and only with it; got shape {shape}")
+    if shape is not None and shape.shape not in ((NUM_SHAPES,), (frames, NUM_SHAPES)):
+        raise ValueError(f"`shape` must have shape (10,) or ({frames}, 10); got {shape.shape}")
 
 
 def _observe(
-    uv: Array, K: Array, T: Array, confidence: Array | None, mask: Array | None, config: FitConfig
+    uv: Array, K: Array, T: Array, confidence: Array | None, mask: Array | None, noise: KeypointNoise
 ) -> tuple[TakeObservations, RobustPoints]:
     """Triangulate, and keep the key points that agree with it as observations."""
     uv = jnp.asarray(uv)
     K, T, known = finite_cameras(K, T, uv.shape[:1])
     seen = usable_keypoints(uv, known, confidence, mask)
-    points = triangulate_robust(uv, K, T, confidence, seen, gate_px=config.gate_px, take_axis=0)
+    points = triangulate_robust(uv, K, T, confidence, seen, noise=noise, take_axis=0)
     trusted = jnp.ones(seen.shape, uv.dtype) if confidence is None else jnp.asarray(confidence, uv.dtype)
     relative = relative_confidence(trusted, seen, 0)
-    sigma = jnp.maximum(points.sigma_px, _LEAST_SIGMA_PX)
-    weights = jnp.where(points.inlier_mask, relative / sigma[:, None, None] ** 2, 0)
-    enough = jnp.sum(points.valid, -1) >= FEWEST_JOINTS
+    weights = jnp.where(points.inlier_mask, relative / points.sigma_px[:, None, None] ** 2, 0)
     clean = jnp.where(points.inlier_mask[..., None], uv, 0)
-    return TakeObservations(clean, weights, K, T, enough), points
+    placed = can_be_placed(points.points, points.valid)
+    return TakeObservations(clean, weights, K, T, placed), points
 
 
 def _start(

@@ -11,19 +11,35 @@ import numpy as np
 from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints
 from poem_jax.fitting.residuals import anatomical_angles
 from poem_jax.geometry.alignment import apply_similarity, procrustes
-from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, skew_matrix, transpose
+from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, smallest_rotation, transpose
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE, WRIST
 from poem_jax.typing import Array, Bool, Float
 
 FEWEST_JOINTS = 3
 """Joints that a frame must have triangulated to be fitted."""
+LEAST_WIDTH_M = 0.005
+"""And how far, root mean square, these must lie from one line: a hand could turn about it."""
 
 _SKELETON = np.array(SKELETON_FROM_OPENPOSE)
 _CHAINS = np.arange(1, NUM_SKELETON_JOINTS).reshape(5, 3)
 _PALM = np.isin(np.arange(NUM_JOINTS), [WRIST, 1, 5, 9, 13, 17])
 """Wrist, thumb base and knuckles: rigid, whatever the pose."""
 _HEEL = np.isin(np.arange(NUM_JOINTS), [WRIST, 1])
-_MIN_COSINE_SUM = 1e-2
+
+
+def can_be_placed(
+    joints_world: Float[Array, "*batch 21 3"], valid: Bool[Array, "*batch 21"]
+) -> Bool[Array, "*batch"]:
+    """Tell whether joints say where a hand is and how it is turned: enough of them, not all on one line."""
+    count = jnp.sum(valid, axis=-1)
+    shown = valid[..., None]
+    mean = jnp.sum(jnp.where(shown, joints_world, 0), -2) / jnp.maximum(count, 1)[..., None]
+    offset = jnp.where(shown, joints_world - mean[..., None, :], 0)
+    scatter = matmul(transpose(offset), offset) / jnp.maximum(count, 1)[..., None, None]
+    # Of eigenvalues a >= b >= c: (ab + ac + bc) / (a + b + c), which is about b + c where a is far larger.
+    trace = jnp.trace(scatter, axis1=-2, axis2=-1)
+    minors = 0.5 * (trace**2 - jnp.sum(scatter**2, axis=(-2, -1)))
+    return (count >= FEWEST_JOINTS) & (minors > LEAST_WIDTH_M**2 * trace)
 
 
 def closed_form_pose(
@@ -71,21 +87,8 @@ def _local_turns(
     return jnp.concatenate([palm[..., None, :, :], fingers], -3)
 
 
-def smallest_rotation(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return the rotation about a x b that turns a towards b (Rodrigues); not one where b is about -a."""
-    a, b = _unit(a), _unit(b)
-    cross = skew_matrix(jnp.cross(a, b))
-    cosine = jnp.sum(a * b, -1)[..., None, None]
-    return jnp.eye(3, dtype=a.dtype) + cross + matmul(cross, cross) / jnp.maximum(1 + cosine, _MIN_COSINE_SUM)
-
-
 def _within_limits(model: KeypointModel, pose: Float[Array, "*batch 16 3"]) -> Float[Array, "*batch 16 3"]:
     angles = anatomical_angles(pose, model.axes)
     angles = jnp.clip(angles, model.limits[..., 0], model.limits[..., 1])
     fingers = jnp.sum(angles[..., None] * model.axes, axis=-2)
     return jnp.concatenate([pose[..., :1, :], fingers], axis=-2)
-
-
-def _unit(v: Array) -> Array:
-    n2 = jnp.sum(v * v, -1, keepdims=True)
-    return v / jnp.sqrt(jnp.maximum(n2, 1e-12))

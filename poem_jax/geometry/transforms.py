@@ -134,6 +134,27 @@ def quaternion_from_rotation(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*ba
     return xp.where(q[..., :1] < 0, -q, q)
 
 
+def smallest_rotation(
+    a: Float[Array, "*#batch 3"], b: Float[Array, "*#batch 3"]
+) -> Float[Array, "*batch 3 3"]:
+    """Return the rotation about a x b that turns the direction of `a` to that of `b`, vectors of any length.
+
+    R = I + [c]x + [c]x^2 / (1 + cos), c = a x b (Rodrigues). Not a rotation where 1 + cos < 0.01 (within 8
+    degrees of opposite, where the axis is undetermined), but finite, as for vectors of length zero.
+    """
+    xp = array_namespace(a, b)
+    a, b = unit_vectors(a), unit_vectors(b)
+    cross = skew_matrix(xp.cross(a, b))
+    cosine = xp.sum(a * b, axis=-1)[..., None, None]
+    return xp.eye(3, dtype=cross.dtype) + cross + matmul(cross, cross) / xp.maximum(1 + cosine, 1e-2)
+
+
+def unit_vectors(v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """Scale vectors to length 1; those shorter than 1e-6 keep their direction and stay finite."""
+    xp = array_namespace(v)
+    return v / xp.sqrt(xp.maximum(xp.sum(v * v, axis=-1, keepdims=True), 1e-12))
+
+
 def rotation_from_6d(x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
     """Orthonormalise two 3-vectors into the first two ROWS of a rotation (Zhou et al. 2019; released
     POEM-v2).

@@ -5,11 +5,10 @@ smallest rotation that brings it from its parent's turn to its observed directio
 skinning. Joints are taken as they are, so that proportions follow too.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from poem_jax.geometry.transforms import matmul, rotation_from_6d, skew_matrix, transpose
+from poem_jax.geometry.transforms import matmul, rotation_from_6d, smallest_rotation, transpose
 from poem_jax.hand.model import HandModel, PosedHand
 from poem_jax.hand.topology import NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE, WRIST
 from poem_jax.typing import Array, Float
@@ -19,7 +18,6 @@ _CHAINS = np.arange(1, NUM_SKELETON_JOINTS, dtype=np.int32).reshape(5, 3)
 _KNUCKLES = np.array([5, 9, 13, 17], np.int32)
 _ACROSS = np.array([1.0, 0.5, -0.5, -1.0])
 """Weights of the knuckles (index to little) for the direction across the palm."""
-_MIN_COSINE_SUM = 1e-2
 
 
 def pose_by_joints(
@@ -59,21 +57,7 @@ def _bone_turns(
     for depth in range(_CHAINS.shape[1]):
         start = _SKELETON[_CHAINS[:, depth]]
         expected = matmul(turn, (rest[start + 1] - rest[start])[..., None])[..., 0]
-        turn = matmul(_smallest_rotation(expected, joints[:, start + 1] - joints[:, start]), turn)
+        turn = matmul(smallest_rotation(expected, joints[:, start + 1] - joints[:, start]), turn)
         turns.append(turn)
     fingers = jnp.stack(turns, 2).reshape(palm.shape[0], -1, 3, 3)
     return jnp.concatenate([palm[:, None], fingers], 1)
-
-
-def _smallest_rotation(
-    a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]
-) -> Float[Array, "*batch 3 3"]:
-    """Return the rotation about a x b that turns a towards b (Rodrigues)."""
-    a, b = _unit(a), _unit(b)
-    cross = skew_matrix(jnp.cross(a, b))
-    cosine = jnp.sum(a * b, -1)[..., None, None]
-    return jnp.eye(3, dtype=a.dtype) + cross + matmul(cross, cross) / jnp.maximum(1 + cosine, _MIN_COSINE_SUM)
-
-
-def _unit(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    return v * jax.lax.rsqrt(jnp.maximum(jnp.sum(v * v, -1, keepdims=True), 1e-12))

@@ -20,7 +20,7 @@ from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO
-from tests.fitting.conftest import make_take
+from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
 
 FRAMES, VIEWS, SIDES = 6, 4, ("right", "left")
 
@@ -28,7 +28,7 @@ FRAMES, VIEWS, SIDES = 6, 4, ("right", "left")
 @pytest.fixture(scope="module")
 def truth():
     """Both hands of a take, each with its own truth, in one rig with lenses."""
-    takes = [make_take(FRAMES, VIEWS, 0.5, 40, hand=default_hand(side)) for side in SIDES]
+    takes = [draw_keypoint_take(default_hand(side), FRAMES, VIEWS, 0.5, 40) for side in SIDES]
     return np.stack([take.joints for take in takes], 1), np.stack([take.vertices for take in takes], 1), takes
 
 
@@ -40,7 +40,7 @@ def take(truth) -> Take:
         np.tile([1280, 720], (VIEWS, 1)),
         takes[0].K.astype(np.float64),
         np.array([[-0.3, 0.1, 1e-3, -2e-3, 0.02 * view] for view in range(VIEWS)]),
-        takes[0].T.astype(np.float64),
+        takes[0].T_cam_from_world.astype(np.float64),
     )
     ideal = np.stack([t.uv_px for t in takes], 1).astype(np.float64)
     raw = [

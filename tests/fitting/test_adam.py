@@ -9,6 +9,7 @@ import pytest
 from poem_jax.fitting.adam import (
     ADAM_300,
     ADAM_300_RELEASE,
+    RELEASE_DIAGONAL_PX,
     AdamParameters,
     AdamRecipe,
     adam_fit,
@@ -17,9 +18,13 @@ from poem_jax.fitting.adam import (
 )
 from poem_jax.fitting.anatomy import axis_angle_from_raw_quaternion
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
+from poem_jax.fitting.silhouette import SilhouetteTarget, silhouette_cross_entropy, silhouette_l1
 from poem_jax.fitting.solvers import fit_take_adam
+from poem_jax.geometry.cameras import Cameras, project
+from poem_jax.geometry.transforms import quaternion_from_rotation, rotation_from_axis_angle
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import hand_mesh
+from poem_jax.render.zbuffer import NO_FACE, rasterise
 
 STATES = {"quaternions": "hand_pose", "shape": "hand_shape", "translation": "hand_tsl"}
 
@@ -91,15 +96,67 @@ def test_the_rates_are_halved_after_the_patience(model, takes):
     take = takes(1, 2, 0.0, 1)
     recipe = AdamRecipe(steps=120, rate=1e-12, shape_rate=1e-12, least_rate=0.0)
     run = jax.jit(partial(adam_fit, recipe=recipe, trace=True))
-    _, trace = run(model, take.uv_px[0], np.ones((2, 21), np.float32), take.K, take.T, released_start())
+    _, trace = run(
+        model, take.uv_px[0], np.ones((2, 21), np.float32), take.K, take.T_cam_from_world, released_start()
+    )
     halved = np.flatnonzero(np.diff(np.asarray(trace.rates)[:, 0])) + 1
     np.testing.assert_array_equal(halved, [52, 103])
 
 
 def test_the_papers_recipe_lowers_the_error(model, takes):
+    """From the flat hand, and further from where a hand already lies close."""
     take = takes(2, 4, 0.0, 2)
     run = jax.jit(partial(fit_take_adam, recipe=ADAM_300))
-    result = run(model, take.uv_px, take.K, take.T)
-    assert bool(result.valid.all())
-    assert np.isfinite(result.vertices).all()
-    assert float(result.reprojection_px.mean()) < 60
+    near = AdamParameters(
+        quaternion_from_rotation(rotation_from_axis_angle(jnp.asarray(take.pose))),
+        jnp.zeros((2, 10)),
+        jnp.asarray(take.joints[:, 0] + 0.01),
+    )
+    flat = jax.vmap(lambda wrist: released_start(None, wrist))(jnp.asarray(take.joints[:, 0]))
+    for start, most_mm in ((flat, 45), (near, 10)):
+        result = run(model, take.uv_px, take.K, take.T_cam_from_world, start=start)
+        assert bool(result.valid.all())
+        assert 1000 * np.linalg.norm(result.joints - take.joints, axis=-1).mean() < most_mm
+
+
+@pytest.mark.parametrize(
+    "loss", [silhouette_cross_entropy, pytest.param(silhouette_l1, marks=pytest.mark.slow)]
+)
+def test_silhouettes_pull_and_are_each_frames_own(model, takes, loss):
+    """Without any key point, masks bring a displaced hand back."""
+    take, size = takes(2, 3, 0.0, 3), (64, 64)
+    offset = np.array([0.006, -0.005, 0.004], np.float32)
+    begin = AdamParameters(
+        quaternion_from_rotation(rotation_from_axis_angle(jnp.asarray(take.pose))),
+        jnp.asarray(take.shape),
+        jnp.asarray(take.joints[:, 0] + offset),
+    )
+    # One camera an axis, near enough that the hand fills the view.
+    turns = rotation_from_axis_angle(np.array([[0, 0, 0], [1.6, 0, 0], [0, 1.6, 0]], np.float32))
+    T = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    T[:, :3, :3], T[:, 2, 3] = turns, 0.6
+    K = np.tile(np.array([[90, 0, 32], [0, 90, 32], [0, 0, 1]], np.float32), (3, 1, 1))
+    uv, depth = project(K[None], T[None], take.vertices[:, None])
+    points = np.concatenate([uv, depth[..., None]], -1)
+    masks = [[rasterise(view, model.hand.faces, size).face_index != NO_FACE for view in f] for f in points]
+    cams = Cameras(*(np.stack([x] * 2) for x in (K, T, np.ones(3, bool))))
+    target = SilhouetteTarget(np.asarray(masks, np.float32), cams)
+    recipe = AdamRecipe(
+        steps=40, rate=1e-3, shape_rate=0.0, patience=10, silhouette_loss=loss, silhouette_sigma=1e-4
+    )
+    run = jax.jit(partial(adam_fit, recipe=recipe))
+
+    def alone(frame, weight):
+        own = jax.tree.map(lambda x: x[frame], (take.uv_px, begin, target))
+        weights = np.full(take.uv_px.shape[1:-1], weight, np.float32)
+        views = (weights, take.K, take.T_cam_from_world)
+        return run(model, own[0], *views, own[1], silhouettes=own[2])[0]
+
+    for frame in range(2):
+        missed = alone(frame, 0.0).translation - take.joints[frame, 0]
+        assert np.linalg.norm(missed) < 0.5 * np.linalg.norm(offset)
+    together = jax.jit(partial(fit_take_adam, recipe=recipe, diagonal_px=RELEASE_DIAGONAL_PX))(
+        model, take.uv_px, take.K, take.T_cam_from_world, start=begin, silhouettes=target
+    )
+    for frame in range(2):
+        np.testing.assert_allclose(together.joints[frame, 0], alone(frame, 1.0).translation, atol=1e-5)

@@ -35,7 +35,9 @@ def check_gradient(cost, x, rng, rtol=1e-5):
 
 def test_reprojection(takes, rng):
     take = takes(2, 3, 0.0, 1)
-    joints, uv, K, T = (np.asarray(x, float) for x in (take.joints, take.uv_px, take.K, take.T))
+    joints, uv, K, T = (
+        np.asarray(x, float) for x in (take.joints, take.uv_px, take.K, take.T_cam_from_world)
+    )
     weights = np.full(uv.shape[:-1], 0.25)
 
     def residual(joints):

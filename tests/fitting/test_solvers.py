@@ -1,19 +1,21 @@
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.fitting.keypoints import KeypointNoise
 from poem_jax.fitting.kinematics import keypoint_model, pose_keypoints
-from poem_jax.fitting.lm import LMConfig, ShapeMode
-from poem_jax.fitting.smooth import SmoothConfig, solve_tridiagonal
+from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState
+from poem_jax.fitting.smooth import SmoothConfig, eliminate, smooth, take_cost
 from poem_jax.fitting.solvers import FitConfig, fit_take
-from poem_jax.fitting.start import closed_form_pose
+from poem_jax.fitting.start import can_be_placed, closed_form_pose
+from poem_jax.geometry.cameras import project
 from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.geometry.triangulation import triangulate
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
+from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
 
 FRAMES = 24
 MODES = {mode: FitConfig(lm=LMConfig(shape_mode=mode)) for mode in ShapeMode}
@@ -22,7 +24,7 @@ fit = jax.jit(fit_take, static_argnames="config")
 
 def shared(model, take, mask=None):
     mask = np.ones(take.uv_px.shape[:-1], bool) if mask is None else mask
-    return fit(model, take.uv_px, take.K, take.T, mask=mask, config=MODES[ShapeMode.SHARED])
+    return fit(model, take.uv_px, take.K, take.T_cam_from_world, mask=mask, config=MODES[ShapeMode.SHARED])
 
 
 def error_mm(result, take, what="joints"):
@@ -45,7 +47,7 @@ def test_the_start_turns_the_bones(model, takes):
 @pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.slow)])
 def test_planted_parameters_are_recovered(takes, side):
     hand = default_hand(side)
-    take = takes(FRAMES, 4, 0.0, 11, hand=hand)
+    take = draw_keypoint_take(hand, FRAMES, 4, 0.0, 11)
     result = shared(keypoint_model(hand), take)
     assert bool(result.valid.all())
     assert error_mm(result, take).max() < 1
@@ -59,37 +61,55 @@ def test_planted_parameters_are_recovered(takes, side):
 @pytest.mark.slow
 def test_200_random_hands_are_recovered(model, takes):
     take = takes(200, 4, 0.0, 12, own_shapes=True)
-    result = fit(model, take.uv_px, take.K, take.T, config=MODES[ShapeMode.PER_FRAME])
+    result = fit(model, take.uv_px, take.K, take.T_cam_from_world, config=MODES[ShapeMode.PER_FRAME])
     found = error_mm(result, take).max(axis=-1) < 2
     assert len(found) == 200
     assert found.mean() >= 0.98
 
 
+def fits(model, takes, views, noise_px, mode=ShapeMode.SHARED, outlier_share=0.0):
+    """The targets are means over rigs and shapes: eight takes of 24 frames, each with its fit."""
+    for seed in range(8):
+        take = takes(FRAMES, views, noise_px, seed, outlier_share=outlier_share)
+        shape = take.shape[0] if mode is ShapeMode.GIVEN else None
+        mask = np.ones(take.uv_px.shape[:-1], bool)
+        args = (model, take.uv_px, take.K, take.T_cam_from_world)
+        yield take, fit(*args, mask=mask, shape=shape, config=MODES[mode])
+
+
 @pytest.mark.parametrize(
     ("views", "noise_px", "most_mm"),
-    [(4, 2, 1.7), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((8, 1, 0.7), (2, 2, 3.5)))],
+    [
+        (4, 2.0, 1.7),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((8, 1.0, 0.7), (2, 2.0, 3.5))),
+    ],
 )
 def test_accuracy_with_unknown_shape(model, takes, views, noise_px, most_mm):
-    take = takes(FRAMES, views, noise_px, 13)
-    result = shared(model, take)
-    assert error_mm(result, take).mean() <= most_mm
-    inside = np.abs(result.joints - take.joints) < result.sigma_m[..., None]
-    assert 0.58 < inside.mean() < 0.80, "the documented range, 60-76 %, holds over many takes"
+    errors, inside = [], []
+    for take, result in fits(model, takes, views, noise_px):
+        assert bool(result.valid.all())
+        errors.append(error_mm(result, take).mean())
+        inside.append((np.abs(result.joints - take.joints) < result.sigma_m[..., None]).mean())
+    assert np.mean(errors) <= most_mm
+    assert 0.60 <= np.mean(inside) <= 0.76
 
 
 @pytest.mark.slow
 def test_accuracy_with_given_shape(model, takes):
-    take = takes(FRAMES, 4, 2.0, 14)
-    shape = jnp.asarray(take.shape[0], jnp.float32)
-    result = fit(model, take.uv_px, take.K, take.T, shape=shape, config=MODES[ShapeMode.GIVEN])
-    assert error_mm(result, take, "vertices").mean() <= 1.5
+    fitted = fits(model, takes, 4, 2.0, ShapeMode.GIVEN)
+    assert np.mean([error_mm(result, take, "vertices").mean() for take, result in fitted]) <= 1.5
 
 
 @pytest.mark.slow
-def test_outliers_hardly_matter(model, takes):
-    clean, dirty = (takes(2 * FRAMES, 8, 1.0, 15, outliers=share) for share in (0.0, 0.1))
-    errors = [error_mm(shared(model, take), take).mean() for take in (clean, dirty)]
-    assert errors[1] < 1.2 * errors[0]
+@pytest.mark.parametrize(("views", "noise_px"), [(8, 1.0), (4, 2.0)])
+def test_outliers_hardly_matter(model, takes, views, noise_px):
+    clean, dirty = (
+        np.mean(
+            [error_mm(result, take).mean() for take, result in fits(model, takes, views, noise_px, **more)]
+        )
+        for more in ({}, {"outlier_share": 0.1})
+    )
+    assert dirty < 1.2 * clean
 
 
 def test_one_bad_frame_does_not_stop_the_take(model, takes):
@@ -116,7 +136,7 @@ def test_the_first_frame_may_be_the_bad_one(model, takes):
 
 def test_one_wild_frame_does_not_hold_back_the_others(model, takes):
     """The other hand's key points agree between the views, and no pose fits them."""
-    take, mirrored = takes(FRAMES, 4, 1.0, 13), takes(FRAMES, 4, 1.0, 13, hand=default_hand("left"))
+    take, mirrored = takes(FRAMES, 4, 1.0, 13), draw_keypoint_take(default_hand("left"), FRAMES, 4, 1.0, 13)
     uv = take.uv_px.copy()
     uv[4] = mirrored.uv_px[4][:, ::-1]
     errors = [error_mm(shared(model, take._replace(uv_px=k)), take) for k in (take.uv_px, uv)]
@@ -140,61 +160,134 @@ def test_all_views_masked(model, takes):
     assert np.isfinite(result.vertices).all()
 
 
-def test_the_tridiagonal_solver_is_exact():
+def test_joints_on_one_line_are_no_hand(model, takes):
+    """A straight index finger says nothing about the turn around it; a bent one does."""
+    take = takes(FRAMES, 4, 0.2, 19)
+    straight = np.asarray(can_be_placed(jnp.asarray(take.joints), jnp.ones((FRAMES, 21), bool)))
+    assert straight.all()
+    line = np.zeros((2, 21, 3), np.float32)
+    line[:, 5:9, 0] = [0, 0.035, 0.06, 0.08]
+    line[1, 7:9, 1] = [0.015, 0.03]
+    line[:, 5:9] += np.random.default_rng(0).normal(scale=1e-3, size=(2, 4, 3))
+    shown = np.tile(np.isin(np.arange(21), [5, 6, 7, 8]), (2, 1))
+    np.testing.assert_array_equal(can_be_placed(jnp.asarray(line), shown), [False, True])
+    two = np.tile(np.isin(np.arange(21), [5, 17]), (FRAMES, 1))
+    assert not np.asarray(can_be_placed(jnp.asarray(take.joints), two)).any()
+
+
+def test_the_elimination_is_exact():
+    """Against the dense matrix: solutions, and the blocks of the inverse."""
     rng = np.random.default_rng(0)
     blocks = rng.normal(size=(4, 3, 3))
-    blocks = (blocks @ np.swapaxes(blocks, -1, -2) + 5 * np.eye(3)).astype(np.float32)
-    coupling, right = -rng.random(3).astype(np.float32), rng.normal(size=(4, 3)).astype(np.float32)
-    whole = np.zeros((12, 12))
+    blocks = (blocks @ np.swapaxes(blocks, -1, -2) + 3 * np.eye(3)).astype(np.float32)
+    right = rng.normal(size=(4, 3, 2)).astype(np.float32)
+    whole = -np.eye(12, k=3) - np.eye(12, k=-3)
     for f in range(4):
         whole[3 * f : 3 * f + 3, 3 * f : 3 * f + 3] = blocks[f]
-        for g in (f - 1, f + 1):
-            if 0 <= g < 4:
-                whole[3 * f : 3 * f + 3, 3 * g : 3 * g + 3] = np.diag(coupling)
-    found = solve_tridiagonal(jnp.asarray(blocks), jnp.asarray(coupling), jnp.asarray(right))
-    np.testing.assert_allclose(np.ravel(found), np.linalg.solve(whole, right.ravel()), rtol=1e-4, atol=1e-5)
+    chain = eliminate(jnp.asarray(blocks))
+    expected = np.linalg.solve(whole, right.reshape(12, 2))
+    np.testing.assert_allclose(chain.solve(jnp.asarray(right)).reshape(12, 2), expected, rtol=1e-4, atol=1e-5)
+    inverse = np.linalg.inv(whole).reshape(4, 3, 4, 3)
+    inverse = np.stack([inverse[f, :, f] for f in range(4)])
+    np.testing.assert_allclose(chain.covariance(), inverse, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_smoothing_helps_a_hand_at_rest(model, takes):
-    one = takes(1, 4, 0.0, 16)
-    noise = np.random.default_rng(0).normal(size=(FRAMES, *one.uv_px.shape[1:]))
-    uv = (one.uv_px + 2 * noise).astype(np.float32)
-    still = one._replace(uv_px=uv)
-    config = FitConfig(smooth=SmoothConfig(sigma_angle=0.01, sigma_m=0.001))
-    smooth = fit(model, uv, one.K, one.T, config=config)
-    uv_gap = uv.copy()
-    uv_gap[7] = np.nan
-    bridged = fit(model, uv_gap, one.K, one.T, config=config)
-    assert error_mm(smooth, still).mean() < 0.75 * error_mm(shared(model, still), still).mean()
-    assert not bridged.valid[7]
-    assert 1000 * np.linalg.norm(bridged.joints[7] - one.joints[0], axis=-1).max() < 4
+def walking(take, hand):
+    """The first frame of a take, wandering as `SmoothConfig()` expects, with 2 px of noise."""
+    rng = np.random.default_rng(20)
+    walk = np.cumsum(rng.normal(size=(FRAMES, 51)), axis=0) * np.repeat([0.02, 0.005], [48, 3])
+    pose = take.pose[:1] + walk[:, :48].reshape(-1, 16, 3)
+    mesh = hand_mesh(hand, pose.astype(np.float32), take.shape, walk[:, 48:].astype(np.float32))
+    uv, _ = project(take.K[None], take.T_cam_from_world[None], mesh.joints[:, None])
+    uv = (uv + 2 * rng.normal(size=uv.shape)).astype(np.float32)
+    return take._replace(uv_px=uv, pose=pose, joints=mesh.joints, vertices=mesh.vertices)
+
+
+def test_the_second_pass(model, takes):
+    """Nearer to the truth, surer of it with reason; and a gap is bridged, but not called valid."""
+    take = walking(takes(FRAMES, 4, 0.0, 13), model.hand)
+    mask = np.ones(take.uv_px.shape[:-1], bool)
+    mask[7] = False
+    config = FitConfig(smooth=SmoothConfig(sigma_angle=0.02, sigma_m=0.005))
+    plain = shared(model, take, mask)
+    smooth = fit(model, take.uv_px, take.K, take.T_cam_from_world, mask=mask, config=config)
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(smooth.valid)), [7])
+    assert error_mm(smooth, take).mean() < 0.85 * error_mm(plain, take).mean()
+    assert 1000 * np.linalg.norm(smooth.joints[7] - take.joints[7], axis=-1).max() < 12
+    assert (smooth.sigma_m[7] == 0).all()
+    others = np.arange(FRAMES) != 7
+    assert (smooth.sigma_m[others] < plain.sigma_m[others]).all()
+    inside = np.abs(smooth.joints - take.joints)[others] < smooth.sigma_m[others][..., None]
+    assert 0.55 < inside.mean() < 0.85
+
+
+def test_the_second_pass_never_raises_the_cost(model, takes):
+    """Also where its model is wrong: unrelated poses, held together as if they were one at rest."""
+    take = takes(4, 4, 1.0, 13)
+    frames = (jnp.broadcast_to(x, (4, *x.shape)) for x in (take.K, take.T_cam_from_world))
+    weights = jnp.ones(take.uv_px.shape[:-1])
+    seen = TakeObservations(jnp.asarray(take.uv_px), weights, *frames, jnp.ones(4, bool))
+    pose, wrist = closed_form_pose(model, take.joints, jnp.ones((4, 21), bool), jnp.zeros((4, 10)))
+    begin = TakeState(pose, wrist, jnp.zeros((4, 10)))
+    motion = SmoothConfig(sigma_angle=1e-3, sigma_m=1e-4)
+
+    @jax.jit
+    def costs(model, state):
+        end = smooth(model, seen, state, LMConfig(), motion)
+        return tuple(take_cost(model, seen, s, LMConfig(), motion) for s in (state, end))
+
+    before, after = costs(model, begin)
+    assert after < before
+
+
+def test_the_size_of_the_images_does_not_matter(model, takes):
+    """Twice the pixels, twice the noise: the same hand."""
+    take = takes(FRAMES, 4, 3.0, 13, outlier_share=0.05)
+    zoom = np.diag([2, 2, 1]).astype(np.float32)
+    config = FitConfig(noise=KeypointNoise.of_images(np.array([[2560, 1440]])))
+    one = shared(model, take)
+    mask = np.ones(take.uv_px.shape[:-1], bool)
+    two = fit(model, 2 * take.uv_px, zoom @ take.K, take.T_cam_from_world, mask=mask, config=config)
+    np.testing.assert_array_equal(one.inlier_mask, two.inlier_mask)
+    np.testing.assert_allclose(one.joints, two.joints, atol=2e-5)
+    np.testing.assert_allclose(2 * one.sigma_px, two.sigma_px, rtol=1e-4)
+    np.testing.assert_allclose(one.sigma_m, two.sigma_m, rtol=1e-2)
 
 
 def test_bad_input_raises(model, takes):
     take = takes(2, 3, 0.0, 17)
+    given = (take.uv_px, take.K, take.T_cam_from_world)
     with pytest.raises(ValueError, match="at least two views"):
-        fit_take(model, take.uv_px[:, :1], take.K[:1], take.T[:1])
+        fit_take(model, take.uv_px[:, :1], take.K[:1], take.T_cam_from_world[:1])
     with pytest.raises(ValueError, match="same views"):
-        fit_take(model, take.uv_px, take.K[:2], take.T[:2])
+        fit_take(model, take.uv_px, take.K[:2], take.T_cam_from_world[:2])
+    with pytest.raises(ValueError, match=r"T_cam_from_world.*\(3, 4, 4\).*got \(3, 3, 4\)"):
+        fit_take(model, take.uv_px, take.K, take.T_cam_from_world[:, :3])
     with pytest.raises(ValueError, match="21, 2"):
-        fit_take(model, take.uv_px[0], take.K, take.T)
+        fit_take(model, take.uv_px[0], take.K, take.T_cam_from_world)
     with pytest.raises(ValueError, match="GIVEN"):
-        fit_take(model, take.uv_px, take.K, take.T, shape=np.zeros(10, np.float32))
+        fit_take(model, *given, shape=np.zeros(10, np.float32))
+    with pytest.raises(ValueError, match="`confidence` must have shape"):
+        fit_take(model, *given, np.ones((2, 3), np.float32))
+    with pytest.raises(ValueError, match="`mask` must have shape"):
+        fit_take(model, *given, mask=np.ones((2, 21), bool))
+    with pytest.raises(ValueError, match=r"\(10,\) or \(2, 10\); got \(5,\)"):
+        fit_take(model, *given, shape=np.zeros(5), config=MODES[ShapeMode.GIVEN])
 
 
 @pytest.mark.parity
 def test_released_key_points(shared_dir):
-    """The stand-in hand bends any way: limits and prior of human joints say nothing about it."""
+    """Closer to the truth than 1.3 mm, and than triangulation alone."""
     folder = shared_dir / "reference" / "poem_v1"
     golden = np.load(folder / "golden_fit.npz")
     keypoints = golden["keypoints"][None]
-    config = FitConfig(lm=LMConfig(prior_weight=0.1, limit_sigma=1.0))
-    result = partial(fit, config=config)(
-        keypoint_model(load(folder / "fake_mano.npz")),
-        keypoints[..., :2],
-        golden["cam_intr"],
-        golden["cam_extr_master_to_cam"],
-        keypoints[..., 2],
+    cameras = (golden["cam_intr"], golden["cam_extr_master_to_cam"])
+    hand = keypoint_model(load(folder / "fake_mano.npz"))
+    result = fit(hand, keypoints[..., :2], *cameras, keypoints[..., 2], config=FitConfig())
+    points, _ = triangulate(keypoints[0, ..., :2], *cameras, weights=np.sqrt(keypoints[0, ..., 2]))
+    fitted, dlt = (
+        1000 * np.linalg.norm(joints - golden["gt_joints"], axis=-1).mean()
+        for joints in (result.joints[0], points)
     )
-    assert 1000 * np.linalg.norm(result.joints[0] - golden["gt_joints"], axis=-1).mean() <= 1.3
+    assert fitted <= 1.3
+    assert fitted < dlt
