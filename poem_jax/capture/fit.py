@@ -17,7 +17,7 @@ from tqdm import tqdm
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
-from poem_jax.capture.keypoint_agreement import check_triangulation, fits_badly, judge_fit, judge_pairs
+from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
 from poem_jax.capture.rig_file import read_rig
@@ -184,14 +184,12 @@ def _check_take(take: Take) -> None:
 def _fit_hand(
     take: Take, keypoints: Array, hands: Hands, index: int, config: "FitConfig"
 ) -> tuple["FitResult", list[str]]:
-    """Fit one hand; where it fits badly, try the other side, and return what is to be said."""
+    """Fit one hand, and as a check one of the other side; return the first, and what is to be said."""
     side = take.hands.hand_side[index]
     confidence = take.hands.confidence
     confidence = np.ones(keypoints[:, index].shape[:-1]) if confidence is None else confidence[:, index]
     evidence = (keypoints[:, index], confidence, take.rig, config)
     own = _run(hands.of(side), *evidence)
-    if not fits_badly(own, config.noise):
-        return own, []
     other = _run(hands.other(side), *evidence)
     return own, judge_fit(take.hand_names[index], own, other, config.noise)
 

@@ -105,13 +105,8 @@ def check_triangulation(rig: Rig, keypoints_px: Float[Array, "frame hand view 21
         )
 
 
-def fits_badly(fitted: "FitResult", noise: "KeypointNoise", least_ratio: float = 2.0) -> bool:
-    """Tell whether a hand is further from its key points than their noise explains."""
-    return bool(_median_error(fitted) > least_ratio * _expected_error(fitted, noise))
-
-
 def judge_fit(name: str, own: "FitResult", other: "FitResult", noise: "KeypointNoise") -> list[str]:
-    """Return warnings: the hand is of the other side, or its key points are in another order.
+    """Return what is to be said of a fitted hand: it is of the other side, or its joints in another order.
 
     Args:
         name: Of the hand.
@@ -119,13 +114,15 @@ def judge_fit(name: str, own: "FitResult", other: "FitResult", noise: "KeypointN
         other: The fit of the opposite side.
         noise: What was expected of the key points.
     """
-    error, error_other = _median_error(own), _median_error(other)
-    if error_other < _FITS_BETTER * error:
+    cost, cost_other = _median(own.cost), _median(other.cost)
+    if cost_other < _FITS_BETTER * cost:
         return [
-            f"hand '{name}' seems to be of the other side: it fits the key points to {error:.1f} px, its "
-            f"mirror image to {error_other:.1f} px; check `hand_side`"
+            f"hand '{name}' seems to be of the other side: as the side that the file names, its joints bend "
+            f"backwards or miss the key points (cost {cost:.0f} a frame); its mirror image fits better "
+            f"({cost_other:.0f}); check `hand_side`"
         ]
-    if fits_badly(own, noise, _FITS_NOT):
+    error = _median(np.where(own.inlier_mask.any(-1), own.reprojection_px, np.nan))
+    if error > _FITS_NOT * _expected_error(own, noise):
         return [
             f"hand '{name}': the views agree with each other to {_expected_error(own, noise):.1f} px, but no "
             f"hand fits the key points better than {error:.1f} px; check that the joints are in OpenPose "
@@ -146,9 +143,8 @@ def _agreeing_share(points: "RobustPoints", keypoints_px: Array) -> float:
     return float(points.inlier_mask[seen].mean()) if seen.any() else 1.0
 
 
-def _median_error(fitted: "FitResult") -> float:
-    errors = np.where(fitted.inlier_mask.any(-1), fitted.reprojection_px, np.nan)
-    finite = errors[np.isfinite(errors)]
+def _median(values: Array) -> float:
+    finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else np.nan
 
 

@@ -25,7 +25,15 @@ from poem_jax.fitting.keypoints import (
     usable_keypoints,
 )
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
-from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState, joint_sigma, solve
+from poem_jax.fitting.lm import (
+    LMConfig,
+    ShapeMode,
+    TakeObservations,
+    TakeState,
+    frame_cost,
+    joint_sigma,
+    solve,
+)
 from poem_jax.fitting.silhouette import SilhouetteTarget
 from poem_jax.fitting.smooth import SmoothConfig, smooth, smoothed_sigma
 from poem_jax.fitting.start import can_be_placed, closed_form_pose
@@ -70,6 +78,9 @@ class FitResult(NamedTuple):
     """The key points that agree with each other, and were fitted."""
     sigma_px: Float[Array, "frame"]
     """Estimated noise of one coordinate of a key point, pixels."""
+    cost: Float[Array, "frame"]
+    """How unlikely the hand is in this frame: half the sum of squares, in standard deviations, of key points
+    (robust), pose prior and joint limits; NaN where not `valid`. A hand of the wrong side costs far more."""
 
 
 def fit_take(
@@ -109,7 +120,7 @@ def fit_take(
     else:
         state = smooth(model, take, state, config.lm, config.smooth)
         sigma = smoothed_sigma(model, take, state, config.lm, config.smooth)
-    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px)
+    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px, config.lm)
 
 
 def fit_take_adam(
@@ -156,7 +167,7 @@ def fit_take_adam(
     pose = axis_angle_from_rotation(rotations_from_raw_quaternions(found.quaternions))
     state = TakeState(pose, found.translation, found.shape)
     sigma = jnp.zeros((*pose.shape[:1], NUM_JOINTS))
-    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px)
+    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px, config.lm)
 
 
 def _check(
@@ -225,6 +236,7 @@ def _result(
     state: TakeState,
     sigma: Array,
     sigma_px: Array,
+    config: LMConfig,
 ) -> FitResult:
     translation = state.wrist - rest_wrist(model, state.shape)
     mesh = hand_mesh(model.hand, state.pose, state.shape, translation)
@@ -248,4 +260,5 @@ def _result(
         jnp.where(valid[:, None], sigma, 0),
         take.weights > 0,
         sigma_px,
+        jnp.where(valid, frame_cost(model, take, state, config.robust_sigmas, config), jnp.nan),
     )
