@@ -36,6 +36,7 @@ HAND = default_hand()
 MODEL = keypoint_model(HAND)
 FIGURE_VIEWS = (2, 3, 4, 6, 8)
 FIGURE_NOISE_PX = (0.5, 1.0, 2.0, 4.0)
+FIGURE_TICKS_MM = (0.2, 0.5, 1, 2, 4, 8)
 
 
 def error_mm(result: FitResult, take: KeypointTake, what: str = "joints") -> float:
@@ -148,8 +149,11 @@ def figure(path: Path, frames: int, seeds: int) -> None:
         axes.plot(FIGURE_VIEWS, errors[:, 1], "o-", color=f"C{index}", label=f"{noise:g} px")
         axes.plot(FIGURE_VIEWS, errors[:, 0], ":", color=f"C{index}")
     axes.set(xlabel="views", ylabel="mean joint error, mm", xticks=FIGURE_VIEWS, yscale="log")
-    axes.grid(True, which="both", alpha=0.3)
-    axes.legend(title="noise of a coordinate")
+    axes.set_yticks(FIGURE_TICKS_MM, map(str, FIGURE_TICKS_MM))
+    axes.minorticks_off()
+    axes.set_ylim(FIGURE_TICKS_MM[0], FIGURE_TICKS_MM[-1])
+    axes.grid(True, alpha=0.3)
+    axes.legend(title="noise of a coordinate", loc="center left", bbox_to_anchor=(1.01, 0.5))
     axes.set_title("Fitted joints (lines) and triangulation alone (dotted)")
     drawing.tight_layout()
     drawing.savefig(path, dpi=110)

@@ -6,6 +6,7 @@ interpreter's lock, nothing is copied, and no worker imports JAX.
 """
 
 from collections.abc import Callable, Generator
+from types import ModuleType
 from typing import TypeVar
 
 _END = 2**62
@@ -24,6 +25,7 @@ def draw_ahead(draw: Callable[[int], _T], first: int, *, ahead: int, workers: in
         workers: threads that draw.
 
     Raises:
+        ModuleNotFoundError: Grain, an extra, is not installed.
         ValueError: sizes below 1 or a negative step. Errors of `draw` reach the caller at their step.
     """
     if min(ahead, workers) < 1 or first < 0:
@@ -31,13 +33,21 @@ def draw_ahead(draw: Callable[[int], _T], first: int, *, ahead: int, workers: in
             "`ahead` and `workers` must be at least 1 and `first` at least 0; "
             f"got {ahead}, {workers} and {first}"
         )
-    return _stream(draw, first, ahead, workers)
+    return _stream(_grain(), draw, first, ahead, workers)
 
 
-def _stream(draw: Callable[[int], _T], first: int, ahead: int, workers: int) -> Generator[_T]:
+def _grain() -> ModuleType:
     # Grain imports JAX: not at the top, or whoever draws samples would too.
-    import grain
+    try:
+        import grain
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("training needs Grain: pip install 'poem-jax[train]'") from error
+    return grain
 
+
+def _stream(
+    grain: ModuleType, draw: Callable[[int], _T], first: int, ahead: int, workers: int
+) -> Generator[_T]:
     options = grain.ReadOptions(num_threads=workers, prefetch_buffer_size=ahead)
     items = iter(grain.MapDataset.range(first, _END).map(draw).to_iter_dataset(options))
     try:

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
+from poem_jax.capture.detect import detect_hands
 from poem_jax.capture.fit import fit, read_keypoint_take
-from poem_jax.capture.rig_file import HALF_PIXEL, write_rig
+from poem_jax.capture.folder import find_frames
+from poem_jax.capture.rig_file import HALF_PIXEL, read_rig, write_rig
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import rigid
 
@@ -94,3 +96,28 @@ def test_inconsistent_cameras_are_named(data, tmp_path):
     assert "'cam_0' and 'cam_2'" in said
     assert written.arrays["valid"].any()
     assert np.isfinite(written.arrays["joints_world"][written.arrays["valid"]]).all()
+
+
+@pytest.mark.filterwarnings("ignore:SymbolDatabase.GetPrototype:UserWarning")
+@pytest.mark.parametrize("folder", ["caliscope_4cam_hands", "caliscope_4cam_board"])
+def test_images_alone_give_the_same_hands(data, tmp_path, folder):
+    """MediaPipe on the images, then the fit: within 3 mm of the fit to the stored key points."""
+    pytest.importorskip("mediapipe", reason="the extra `detect` is not installed")
+    stored = np.load(data / folder / "pseudo_gt.npz")
+    keypoints, _, frames = tracks(stored)
+    found_rig = read_rig(data / folder / "calibration" / "rig.json")
+    hands = detect_hands(find_frames(data / folder, found_rig.names), found_rig, progress=False)
+    assert hands.frames is not None
+    order = [hands.frames.index(name) for name in sorted(hands.frames)]
+    assert [int(hands.frames[index]) for index in order] == [int(frame) for frame in frames]
+    results = [
+        fit(
+            read_keypoint_take(as_file(tmp_path, points, SIDES), data / folder / "calibration" / "rig.json"),
+            tmp_path / "out",
+            progress=False,
+        )
+        for points in (keypoints, hands.keypoints_px[order])
+    ]
+    assert all(result.arrays["valid"].all() for result in results)
+    one, other = (result.arrays["joints_world"] for result in results)
+    assert 1000 * np.median(np.linalg.norm(one - other, axis=-1)) <= 3

@@ -65,3 +65,9 @@ def test_bad_settings_are_refused(wrong):
 def test_naming_the_loader_imports_no_jax():
     code = "import sys, poem_jax.data.loader; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_without_grain_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "grain", None)
+    with pytest.raises(ModuleNotFoundError, match=r"poem-jax\[train\]"):
+        draw_ahead(late, 0, ahead=1, workers=1)
