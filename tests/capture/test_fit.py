@@ -276,17 +276,30 @@ def test_hands_outside_their_image_are_not_fitted(files, take, tmp_path, caplog)
     assert "outside" in caplog.text
 
 
-def test_options_of_the_command(files, fitted, tmp_path):
-    """The shipped hand as the user's own file gives the same hands."""
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_users_own_hand(files, fitted, tmp_path, side):
+    """The shipped hand as the user's file, of either side, gives the same hands."""
     keypoints, rig, _ = files
-    hand = default_hand()._asdict()
+    hand = default_hand(side)._asdict()
     fields = {"f" if name == "faces" else name: value for name, value in hand.items() if name != "is_left"}
-    np.savez(tmp_path / "hand.npz", **fields)
-    command = ["fit", str(keypoints), "--rig", str(rig), "--out"]
-    assert main([*command, str(tmp_path / "own"), "--mano", str(tmp_path / "hand.npz")]) == 0
-    own = np.load(tmp_path / "own" / "prediction.npz")
+    np.savez(tmp_path / f"my_{side}.npz", **fields)
+    command = ["fit", str(keypoints), "--rig", str(rig), "--out", str(tmp_path / "out"), "--mano"]
+    assert main([*command, str(tmp_path / f"my_{side}.npz")]) == 0
+    own = np.load(tmp_path / "out" / "prediction.npz")
     np.testing.assert_allclose(own["vertices_world"], fitted.arrays["vertices_world"], atol=1e-4)
-    assert main([*command, str(tmp_path / "none"), "--mano", str(tmp_path / "missing.pkl")]) == 2
+    assert main([*command, str(tmp_path / "missing.pkl")]) == 2
+
+
+def test_smoothing_from_the_command_line(files, fitted, tmp_path):
+    """Unrelated frames are drawn together, and it is on record."""
+    keypoints, rig, _ = files
+    out = tmp_path / "out"
+    assert main(["fit", str(keypoints), "--rig", str(rig), "--out", str(out), "--smooth"]) == 0
+    assert json.loads((out / "report.json").read_text())["smooth"] is True
+    smooth, plain = np.load(out / "prediction.npz"), fitted.arrays
+    assert smooth["valid"].all()
+    steps = [np.linalg.norm(np.diff(a["joints_world"], axis=0), axis=-1).mean() for a in (smooth, plain)]
+    assert steps[0] < steps[1]
 
 
 def test_a_file_without_frames_is_refused(files, take, tmp_path):
