@@ -17,7 +17,7 @@ from tqdm import tqdm
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
-from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
+from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs, padded_frames
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
 from poem_jax.capture.rig_file import read_rig
@@ -199,9 +199,11 @@ def _run(hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config:
 
     from poem_jax.fitting.kinematics import keypoint_model
 
-    arrays = (keypoints, rig.K, rig.T_cam_from_world, confidence)
+    frames = len(keypoints)
+    arrays = (padded_frames(keypoints), rig.K, rig.T_cam_from_world, padded_frames(confidence))
     arrays = tuple(np.asarray(array, np.float32) for array in arrays)
-    return jax.device_get(_program(config)(keypoint_model(hand), *arrays))
+    fitted = jax.device_get(_program(config)(keypoint_model(hand), *arrays))
+    return jax.tree.map(lambda array: array[:frames], fitted)
 
 
 @functools.cache

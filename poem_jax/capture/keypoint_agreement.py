@@ -30,11 +30,23 @@ _SUSPICIOUS_SHARE = 0.006
 """Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
 between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
 _LEAST_POINTS = 21
+_FRAMES_TOGETHER = 128
 _FITS_BETTER = 0.7
 _FITS_NOT = 4.0
 _AGREEING = (0.75, 0.9)
 """Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
 their inverses are right."""
+
+
+def padded_frames(array: Float[Array, "frame *rest"]) -> Float[Array, "more *rest"]:
+    """Add frames in which nothing is seen (NaN), so that takes of similar length share compiled programs.
+
+    To the next power of two, beyond 128 frames to the next multiple of 128.
+    """
+    frames = len(array)
+    many = -(-frames // _FRAMES_TOGETHER) * _FRAMES_TOGETHER
+    padded = many if frames > _FRAMES_TOGETHER else 2 ** int(np.ceil(np.log2(frames)))
+    return np.concatenate([array, np.full((padded - frames, *array.shape[1:]), np.nan)])
 
 
 def epipolar_distances_px(
@@ -154,9 +166,10 @@ def _triangulated(rig: Rig, keypoints_px: Array) -> "RobustPoints":
 
     from poem_jax.fitting.keypoints import KeypointNoise
 
-    arrays = (keypoints_px, rig.K, rig.T_cam_from_world)
+    arrays = (padded_frames(keypoints_px), rig.K, rig.T_cam_from_world)
     program = _program(KeypointNoise.of_images(rig.size_wh))
-    return jax.device_get(program(*(np.asarray(array, np.float32) for array in arrays)))
+    points = jax.device_get(program(*(np.asarray(array, np.float32) for array in arrays)))
+    return jax.tree.map(lambda array: array[: len(keypoints_px)], points)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import pytest
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.fit import fit, hands_of, ideal_keypoints, read_keypoint_take
 from poem_jax.capture.folder import FramePaths
-from poem_jax.capture.keypoint_agreement import epipolar_distances_px
+from poem_jax.capture.keypoint_agreement import epipolar_distances_px, padded_frames
 from poem_jax.capture.rig_file import write_rig
 from poem_jax.capture.take import Take
 from poem_jax.cli import main
@@ -300,6 +300,15 @@ def test_smoothing_from_the_command_line(files, fitted, tmp_path):
     assert smooth["valid"].all()
     steps = [np.linalg.norm(np.diff(a["joints_world"], axis=0), axis=-1).mean() for a in (smooth, plain)]
     assert steps[0] < steps[1]
+
+
+@pytest.mark.parametrize(("frames", "padded"), [(1, 1), (3, 4), (8, 8), (100, 128), (129, 256), (300, 384)])
+def test_takes_are_padded_to_few_lengths(frames, padded):
+    array = np.arange(2.0 * frames).reshape(frames, 2)
+    longer = padded_frames(array)
+    assert longer.shape == (padded, 2)
+    np.testing.assert_array_equal(longer[:frames], array)
+    assert np.isnan(longer[frames:]).all()
 
 
 def test_a_file_without_frames_is_refused(files, take, tmp_path):

@@ -123,6 +123,20 @@ def test_one_bad_frame_does_not_stop_the_take(model, takes):
     assert error_mm(result, take).mean() < 1.5
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("second_pass", [None, SmoothConfig()])
+def test_frames_without_key_points_change_nothing(model, takes, second_pass):
+    take, config = takes(FRAMES, 4, 1.0, 13), FitConfig(smooth=second_pass)
+    uv = take.uv_px.copy()
+    uv[16:] = np.nan
+    padded, alone = (
+        fit(model, k, take.K, take.T_cam_from_world, config=config) for k in (uv, take.uv_px[:16])
+    )
+    assert bool(alone.valid.all())
+    for name in ("joints", "vertices", "sigma_m", "cost"):
+        np.testing.assert_allclose(getattr(padded, name)[:16], getattr(alone, name), rtol=1e-3, atol=2e-5)
+
+
 def test_the_first_frame_may_be_the_bad_one(model, takes):
     take = takes(FRAMES, 4, 1.0, 13)
     uv = take.uv_px.copy()
