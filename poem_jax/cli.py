@@ -68,6 +68,10 @@ class Reconstruct:
     """Model folder that poem_jax.save wrote; without it the shipped weights."""
     engine: Literal["network", "fit"] = "network"
     """fit: no network, the hand model fitted to key points (then --boxes must hold them)."""
+    mano: _Optional = None
+    """With --engine fit, as for `poem fit`."""
+    smooth: _Flag = False
+    """With --engine fit, as for `poem fit`."""
     debug: _Flag = False
     """Show the full traceback of an error."""
 
@@ -79,8 +83,11 @@ class Reconstruct:
             from poem_jax.capture.fit import fit
             from poem_jax.capture.take import read_take
 
-            written = fit(read_take(self.folder, self.rig, self.boxes), self.out)
+            take = read_take(self.folder, self.rig, self.boxes)
+            written = fit(take, self.out, hand=_hand(self.mano), smooth=self.smooth)
         else:
+            if self.mano is not None or self.smooth:
+                raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
             written = _reconstruct(self.folder, self.rig, self.boxes, self.out, self.checkpoint)
         _print_files(written, self.out)
         _print_summary(written.report)

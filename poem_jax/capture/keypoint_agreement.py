@@ -31,7 +31,9 @@ _SUSPICIOUS_SHARE = 0.006
 between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
 _LEAST_POINTS = 21
 _FRAMES_TOGETHER = 128
-_FITS_BETTER = 0.7
+_LEAST_GAIN = 5.0
+_MOST_FRAMES = 0.75
+"""The mirror image must be likelier by e^5 in the median frame, and likelier at all in three of four."""
 _FITS_NOT = 4.0
 _AGREEING = (0.75, 0.9)
 """Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
@@ -126,19 +128,19 @@ def judge_fit(name: str, own: "FitResult", other: "FitResult", noise: "KeypointN
         other: The fit of the opposite side.
         noise: What was expected of the key points.
     """
-    cost, cost_other = _median(own.cost), _median(other.cost)
-    if cost_other < _FITS_BETTER * cost:
-        return [
-            f"hand '{name}' seems to be of the other side: as the side that the file names, its joints bend "
-            f"backwards or miss the key points (cost {cost:.0f} a frame); its mirror image fits better "
-            f"({cost_other:.0f}); check `hand_side`"
-        ]
-    error = _median(np.where(own.inlier_mask.any(-1), own.reprojection_px, np.nan))
+    error = min(_median_error(own), _median_error(other))
     if error > _FITS_NOT * _expected_error(own, noise):
         return [
-            f"hand '{name}': the views agree with each other to {_expected_error(own, noise):.1f} px, but no "
-            f"hand fits the key points better than {error:.1f} px; check that the joints are in OpenPose "
-            "order (wrist, then thumb to little finger, each from its base to its tip)"
+            f"hand '{name}': the views agree with each other to {np.median(own.sigma_px):.1f} px, but no "
+            f"hand of either side fits the key points better than {error:.1f} px; check that the joints are "
+            "in OpenPose order (wrist, then thumb to little finger, each from its base to its tip)"
+        ]
+    gain = own.cost - other.cost
+    gain = gain[np.isfinite(gain)]
+    if gain.size and np.median(gain) > _LEAST_GAIN and (gain > 0).mean() >= _MOST_FRAMES:
+        return [
+            f"hand '{name}' seems to be of the other side: its mirror image is likelier by a factor of "
+            f"e^{np.median(gain):.0f} a frame (median), as its joints bend the natural way; check `hand_side`"
         ]
     return []
 
@@ -155,7 +157,8 @@ def _agreeing_share(points: "RobustPoints", keypoints_px: Array) -> float:
     return float(points.inlier_mask[seen].mean()) if seen.any() else 1.0
 
 
-def _median(values: Array) -> float:
+def _median_error(fitted: "FitResult") -> float:
+    values = np.where(fitted.inlier_mask.any(-1), fitted.reprojection_px, np.nan)
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else np.nan
 

@@ -7,7 +7,8 @@ reprojection error refine it. With few cameras this search is exhaustive: no ran
 
 Letters: r = reprojection residual (px); J = d r / d point (2 v, 3); w = confidence of a view; s = noise of
 one coordinate of a key point of confidence 1 (px), estimated from the residuals of a whole take with a
-scaled inverse chi-square prior. The covariance of a joint is s^2 (sum_v w J_v^T J_v)^-1.
+scaled inverse chi-square prior: first from their median, then from those of the views that agree. The
+covariance of a joint is s^2 (sum_v w J_v^T J_v)^-1.
 """
 
 import math
@@ -105,7 +106,7 @@ def triangulate_robust(
     uv, weights, K, T = _clean_inputs(uv_px, K, T_cam_from_world, confidence, mask, take_axis)
     start, inliers = _vote(uv, weights, K, T, noise.gate_px)
     points = _refine(start, uv, weights * inliers, K, T)
-    sigma = _estimate_noise(points, uv, weights * inliers, K, T, take_axis, noise)
+    sigma = _first_noise(points, uv, weights * inliers, K, T, take_axis, noise)
     inliers = _agreeing(points, uv, weights, K, T, _GATE_SIGMAS * sigma, noise.gate_px)
     inliers = inliers & (jnp.sum(inliers, -2, keepdims=True) >= _FEWEST_VIEWS)
     used = weights * inliers
@@ -296,6 +297,51 @@ def _inverse(H: Array, solvable: Array) -> Float[Array, "*batch joint 3 3"]:
     return adjugate / jnp.maximum(determinant, _DAMPING**2) / scale
 
 
+def _first_noise(
+    points: Array,
+    uv: Array,
+    weights: Array,
+    K: Array,
+    T: Array,
+    take_axis: int | None,
+    noise: KeypointNoise,
+) -> Float[Array, "*batch"]:
+    """Estimate the noise where outliers may still be counted: from the median over joints.
+
+    The median of chi^2_k / k is about (1 - 2 / 9k)^3 (Wilson and Hilferty 1931).
+    """
+    square, freedom = _residuals(points, uv, weights, K, T)
+    per_freedom = square / jnp.maximum(freedom, 1) / (1 - 2 / (9 * jnp.maximum(freedom, 1))) ** 3
+    per_freedom = jnp.where(freedom > 0, per_freedom, jnp.nan)
+    axes = -1 if take_axis is None else (take_axis % freedom.ndim, freedom.ndim - 1)
+    if take_axis is None:
+        middle, count = jnp.nanmedian(per_freedom, axis=-1), jnp.sum(freedom, axis=-1)
+    else:
+        middle = jnp.nanmedian(per_freedom, axis=axes, keepdims=True)[..., 0]
+        count = jnp.sum(freedom, axis=axes, keepdims=True)[..., 0]
+        middle, count = (jnp.broadcast_to(x, freedom.shape[:-1]) for x in (middle, count))
+    return _with_expected(jnp.where(count > 0, middle, 0) * count, count, noise)
+
+
+def _with_expected(
+    square: Float[Array, "*batch"], freedom: Float[Array, "*batch"], noise: KeypointNoise
+) -> Float[Array, "*batch"]:
+    """Return the noise from a sum of squares and its degrees of freedom, and what was expected before."""
+    variance = (_EXPECTED_COUNT * noise.expected_px**2 + square) / (_EXPECTED_COUNT + freedom)
+    return jnp.maximum(jnp.sqrt(variance), noise.least_px)
+
+
+def _residuals(
+    points: Array, uv: Array, weights: Array, K: Array, T: Array
+) -> tuple[Float[Array, "*batch joint"], Float[Array, "*batch joint"]]:
+    """Return the weighted sum of squares of every joint (px^2), and its 2 v - 3 degrees of freedom."""
+    count = jnp.sum(weights > 0, axis=-2)
+    error2, _ = _square_errors(points, uv, K, T)
+    counted = count >= _FEWEST_VIEWS
+    square = jnp.where(counted, jnp.sum(weights * error2, axis=-2), 0)
+    return square, jnp.where(counted, 2 * count - 3, 0).astype(square.dtype)
+
+
 def _estimate_noise(
     points: Array,
     uv: Array,
@@ -305,16 +351,11 @@ def _estimate_noise(
     take_axis: int | None,
     noise: KeypointNoise,
 ) -> Float[Array, "*batch"]:
-    """Estimate the noise of one coordinate from residuals, 2 v - 3 degrees of freedom per joint."""
-    count = jnp.sum(weights > 0, axis=-2)
-    error2, _ = _square_errors(points, uv, K, T)
-    counted = count >= _FEWEST_VIEWS
-    square = jnp.sum(jnp.where(counted[..., None, :], weights * error2, 0), axis=(-2, -1))
-    freedom = jnp.sum(jnp.where(counted, 2 * count - 3, 0), axis=-1).astype(square.dtype)
+    """Estimate the noise of one coordinate from the residuals of views that agree."""
+    square, freedom = (jnp.sum(x, axis=-1) for x in _residuals(points, uv, weights, K, T))
     if take_axis is not None:
         square, freedom = (jnp.sum(x, take_axis, keepdims=True) + 0 * x for x in (square, freedom))
-    variance = (_EXPECTED_COUNT * noise.expected_px**2 + square) / (_EXPECTED_COUNT + freedom)
-    return jnp.maximum(jnp.sqrt(variance), noise.least_px)
+    return _with_expected(square, freedom, noise)
 
 
 def _with_uncertainty(

@@ -66,7 +66,7 @@ class LMConfig:
     """Static settings of the solver."""
 
     iterations: int = 10
-    shape_mode: ShapeMode = ShapeMode.SHARED
+    shape_mode: ShapeMode | str = ShapeMode.SHARED
     robust_sigmas: float = 5.0
     """Where the robust kernel cuts off, in standard deviations of a key point."""
     first_robust_sigmas: float = 50.0
@@ -77,6 +77,9 @@ class LMConfig:
     """Radians; how softly joints are stopped beyond their limits."""
     least_prior_sigma: float = LEAST_PRIOR_SIGMA
     """Radians; no angle is held tighter than this by the prior."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape_mode", ShapeMode(self.shape_mode))
 
 
 class TakeObservations(NamedTuple):
@@ -130,10 +133,15 @@ def joint_sigma(
 ) -> Float[Array, "frame 21"]:
     """Return the standard deviation of one coordinate of every joint, metres, given all observations."""
     equations = normal_equations(model, take, state, config.robust_sigmas, config)
-    factor = _factor(equations.H, jnp.full_like(take.frame_mask, _LEAST_DAMPING, state.pose.dtype))
-    eye = jnp.broadcast_to(jnp.eye(STATE_SIZE, dtype=equations.H.dtype), equations.H.shape)
-    solved = _solve(factor, jnp.concatenate([eye, equations.H_shape], axis=-1))
-    return posterior_sigma(equations, solved[..., :STATE_SIZE], solved[..., STATE_SIZE:], take, state, config)
+    covariance = conditional_covariance(equations)
+    return posterior_sigma(equations, covariance, matmul(covariance, equations.H_shape), take, state, config)
+
+
+def conditional_covariance(equations: NormalEquations) -> Float[Array, "frame 51 51"]:
+    """Return the covariance of every frame's 51 numbers given the shape: H^-1."""
+    H = equations.H
+    factor = _factor(H, jnp.full(H.shape[:1], _LEAST_DAMPING, H.dtype))
+    return _solve(factor, jnp.broadcast_to(jnp.eye(STATE_SIZE, dtype=H.dtype), H.shape))
 
 
 def posterior_sigma(
@@ -177,7 +185,7 @@ def normal_equations(
     rows = (both.shape[0], NUM_JOINTS * 3, STATE_SIZE + NUM_SHAPES)
     H = matmul(jnp.swapaxes(both.reshape(rows), -1, -2), weighted.reshape(rows))
     g = jnp.sum(both * b[..., None], axis=(-3, -2))
-    prior_H, prior_g = _prior_equations(model, state, config)
+    prior_H, prior_g = prior_equations(model, state, config)
     x = slice(0, STATE_SIZE)
     y = slice(STATE_SIZE, None)
     return NormalEquations(
@@ -296,7 +304,7 @@ def _joint_information(
     return A, jnp.sum(weighted * offset[..., None], axis=(-2, -4))
 
 
-def _prior_equations(
+def prior_equations(
     model: KeypointModel, state: TakeState, config: LMConfig
 ) -> tuple[Float[Array, "frame 51 51"], Float[Array, "frame 51"]]:
     """Return normal matrix and gradient of pose prior and limits, both diagonal in anatomical angles."""

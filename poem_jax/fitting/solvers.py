@@ -53,7 +53,11 @@ class FitConfig:
     noise: KeypointNoise = field(default_factory=KeypointNoise)
     """What to expect of the key points: `KeypointNoise.of_images(size_wh)` for images of another size."""
     smooth: SmoothConfig | None = None
-    """A second pass over the whole take; None leaves it out."""
+    """A second pass over the whole take; None leaves it out. Not with a shape of its own in every frame."""
+
+    def __post_init__(self) -> None:
+        if self.smooth is not None and self.lm.shape_mode is ShapeMode.PER_FRAME:
+            raise ValueError("`smooth` holds the frames of one hand together; got ShapeMode.PER_FRAME")
 
 
 class FitResult(NamedTuple):
@@ -80,7 +84,7 @@ class FitResult(NamedTuple):
     """Estimated noise of one coordinate of a key point, pixels."""
     cost: Float[Array, "frame"]
     """How unlikely the hand is in this frame: half the sum of squares, in standard deviations, of key points
-    (robust), pose prior and joint limits; NaN where not `valid`. A hand of the wrong side costs far more."""
+    (robust), pose prior and joint limits; NaN where not `valid`. A hand of the wrong side costs more."""
 
 
 def fit_take(
@@ -105,7 +109,8 @@ def fit_take(
         confidence: (frame, view, 21) inverse variance, on any scale; NaN or zero = unseen; None means equal.
         mask: (frame, view, 21); False means "ignore".
         shape: the known shape (10,) or (frame, 10); needed by, and only used in, `ShapeMode.GIVEN`.
-        config: static under `jax.jit`.
+        config: static under `jax.jit`; its `noise` is that of 1280 x 720 images unless given:
+            `FitConfig(noise=KeypointNoise.of_images(size_wh))`.
 
     Raises:
         ValueError: fewer than two views; key points, cameras and shape that do not belong together.
@@ -118,8 +123,8 @@ def fit_take(
     if config.smooth is None:
         sigma = joint_sigma(model, take, state, config.lm)
     else:
-        state = smooth(model, take, state, config.lm, config.smooth)
-        sigma = smoothed_sigma(model, take, state, config.lm, config.smooth)
+        state, motion = smooth(model, take, state, config.lm, config.smooth)
+        sigma = smoothed_sigma(model, take, state, config.lm, motion)
     return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px, config.lm)
 
 
@@ -211,7 +216,7 @@ def _observe(
     relative = relative_confidence(trusted, seen, 0)
     weights = jnp.where(points.inlier_mask, relative / points.sigma_px[:, None, None] ** 2, 0)
     clean = jnp.where(points.inlier_mask[..., None], uv, 0)
-    placed = can_be_placed(points.points, points.valid)
+    placed = can_be_placed(points.points, points.valid, points.covariance)
     return TakeObservations(clean, weights, K, T, placed), points
 
 

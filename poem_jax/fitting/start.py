@@ -28,18 +28,22 @@ _HEEL = np.isin(np.arange(NUM_JOINTS), [WRIST, 1])
 
 
 def can_be_placed(
-    joints_world: Float[Array, "*batch 21 3"], valid: Bool[Array, "*batch 21"]
+    joints_world: Float[Array, "*batch 21 3"],
+    valid: Bool[Array, "*batch 21"],
+    covariance: Float[Array, "*batch 21 3 3"],
 ) -> Bool[Array, "*batch"]:
-    """Tell whether joints say where a hand is and how it is turned: enough of them, not all on one line."""
+    """Tell whether joints say where a hand is and how it is turned: enough of them, not all on one line.
+
+    The second eigenvalue of their scatter decides; what three times the `covariance` (square metres) of the
+    joints explains does not count as width.
+    """
     count = jnp.sum(valid, axis=-1)
-    shown = valid[..., None]
-    mean = jnp.sum(jnp.where(shown, joints_world, 0), -2) / jnp.maximum(count, 1)[..., None]
-    offset = jnp.where(shown, joints_world - mean[..., None, :], 0)
-    scatter = matmul(transpose(offset), offset) / jnp.maximum(count, 1)[..., None, None]
-    # Of eigenvalues a >= b >= c: (ab + ac + bc) / (a + b + c), which is about b + c where a is far larger.
-    trace = jnp.trace(scatter, axis1=-2, axis2=-1)
-    minors = 0.5 * (trace**2 - jnp.sum(scatter**2, axis=(-2, -1)))
-    return (count >= FEWEST_JOINTS) & (minors > LEAST_WIDTH_M**2 * trace)
+    share = (valid / jnp.maximum(count, 1)[..., None]).astype(joints_world.dtype)[..., None]
+    offset = joints_world - jnp.sum(share * joints_world, axis=-2, keepdims=True)
+    scatter = matmul(transpose(share * offset), offset)
+    noise = jnp.sum(share[..., None] * covariance, axis=-3)
+    width = jnp.linalg.eigvalsh(scatter - 3 * noise)[..., 1]
+    return (count >= FEWEST_JOINTS) & (width > LEAST_WIDTH_M**2)
 
 
 def closed_form_pose(

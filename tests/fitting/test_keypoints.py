@@ -147,6 +147,14 @@ def test_sigma_is_calibrated(takes):
     assert float(found.sigma_px[0]) == pytest.approx(2.0, rel=0.1)
 
 
+def test_the_noise_is_known_in_spite_of_outliers(takes):
+    """Two views show outliers by one number a joint only; the true noise is 2 px."""
+    for seed in (8, 9):
+        take = takes(60, 2, 2.0, seed, outlier_share=0.1)
+        found = robust(take.uv_px, take.K, take.T_cam_from_world, take_axis=0)
+        assert float(found.sigma_px[0]) == pytest.approx(2.0, rel=0.4)
+
+
 def test_bad_shapes_raise(takes):
     take = takes(1, 3, 0.0, 9)
     with pytest.raises(ValueError, match="at least two views"):

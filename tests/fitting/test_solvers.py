@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.capture.keypoint_agreement import judge_fit
 from poem_jax.fitting.keypoints import KeypointNoise
 from poem_jax.fitting.kinematics import keypoint_model, pose_keypoints
 from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState
@@ -18,6 +19,7 @@ from poem_jax.hand.template import default_hand
 from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
 
 FRAMES = 24
+AT_REST = SmoothConfig(sigma_angle=0.02, sigma_m=0.005)
 MODES = {mode: FitConfig(lm=LMConfig(shape_mode=mode)) for mode in ShapeMode}
 fit = jax.jit(fit_take, static_argnames="config")
 
@@ -124,17 +126,31 @@ def test_one_bad_frame_does_not_stop_the_take(model, takes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("second_pass", [None, SmoothConfig()])
-def test_frames_without_key_points_change_nothing(model, takes, second_pass):
-    take, config = takes(FRAMES, 4, 1.0, 13), FitConfig(smooth=second_pass)
+def test_frames_without_key_points_change_nothing(model, takes):
+    take, config = takes(FRAMES, 4, 2.0, 13), FitConfig(smooth=AT_REST)
     uv = take.uv_px.copy()
-    uv[16:] = np.nan
-    padded, alone = (
-        fit(model, k, take.K, take.T_cam_from_world, config=config) for k in (uv, take.uv_px[:16])
-    )
+    uv[9:] = np.nan
+    cameras = (take.K, take.T_cam_from_world)
+    padded = smoothed(model, take._replace(uv_px=uv))
+    alone = fit(model, uv[:9], *cameras, mask=np.ones((9, 4, 21), bool), config=config)
     assert bool(alone.valid.all())
-    for name in ("joints", "vertices", "sigma_m", "cost"):
-        np.testing.assert_allclose(getattr(padded, name)[:16], getattr(alone, name), rtol=1e-3, atol=2e-5)
+    for name in ("joints", "vertices", "sigma_m"):
+        np.testing.assert_allclose(getattr(padded, name)[:9], getattr(alone, name), atol=2e-5)
+
+
+@pytest.mark.parametrize("bend", [0.1, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_the_wrong_side_is_less_likely(takes, bend):
+    """Also of a nearly flat hand; and the right side is never doubted."""
+    right, left = (keypoint_model(default_hand(side)) for side in ("right", "left"))
+    take = takes(FRAMES, 4, 0.0, 21)
+    pose = np.concatenate([take.pose[:, :1], bend * take.pose[:, 1:]], axis=1)
+    mesh = hand_mesh(default_hand(), pose, take.shape, np.zeros((FRAMES, 3), np.float32))
+    uv, _ = project(take.K[None], take.T_cam_from_world[None], mesh.joints[:, None])
+    uv = (uv + np.random.default_rng(0).normal(size=uv.shape)).astype(np.float32)
+    own, other = (jax.device_get(shared(model, take._replace(uv_px=uv))) for model in (right, left))
+    assert judge_fit("hand", own, other, KeypointNoise()) == []
+    (said,) = judge_fit("hand", other, own, KeypointNoise())
+    assert "other side" in said
 
 
 def test_the_first_frame_may_be_the_bad_one(model, takes):
@@ -175,18 +191,33 @@ def test_all_views_masked(model, takes):
 
 
 def test_joints_on_one_line_are_no_hand(model, takes):
-    """A straight index finger says nothing about the turn around it; a bent one does."""
+    """A straight index finger says nothing about the turn around it; a bent one does, if it is seen well."""
     take = takes(FRAMES, 4, 0.2, 19)
-    straight = np.asarray(can_be_placed(jnp.asarray(take.joints), jnp.ones((FRAMES, 21), bool)))
-    assert straight.all()
-    line = np.zeros((2, 21, 3), np.float32)
+    known = np.zeros((FRAMES, 21, 3, 3), np.float32)
+    assert np.asarray(can_be_placed(take.joints, np.ones((FRAMES, 21), bool), known)).all()
+    line = np.zeros((3, 21, 3), np.float32)
     line[:, 5:9, 0] = [0, 0.035, 0.06, 0.08]
-    line[1, 7:9, 1] = [0.015, 0.03]
-    line[:, 5:9] += np.random.default_rng(0).normal(scale=1e-3, size=(2, 4, 3))
-    shown = np.tile(np.isin(np.arange(21), [5, 6, 7, 8]), (2, 1))
-    np.testing.assert_array_equal(can_be_placed(jnp.asarray(line), shown), [False, True])
+    line[1:, 7:9, :2] = [0.045, 0.03], [0.03, 0.04]
+    line[:, 5:9] += np.random.default_rng(0).normal(scale=1e-3, size=(3, 4, 3))
+    shown = np.tile(np.isin(np.arange(21), [5, 6, 7, 8]), (3, 1))
+    noise = np.zeros((3, 21, 3, 3), np.float32)
+    noise[:] = 1e-6 * np.eye(3)
+    noise[2] = np.diag([1e-6, 4e-4, 1e-6])
+    np.testing.assert_array_equal(can_be_placed(line, shown, noise), [False, True, False])
     two = np.tile(np.isin(np.arange(21), [5, 17]), (FRAMES, 1))
-    assert not np.asarray(can_be_placed(jnp.asarray(take.joints), two)).any()
+    assert not np.asarray(can_be_placed(take.joints, two, known)).any()
+
+
+def test_a_frame_with_one_straight_finger_is_not_valid(model, takes):
+    take = takes(FRAMES, 4, 1.0, 13)
+    uv = take.uv_px.copy()
+    finger = np.arange(5, 9)
+    line = take.joints[3, 5] + np.array([0, 0.035, 0.06, 0.08])[:, None] * np.array([0.6, 0.0, 0.8])
+    uv[3] = np.nan
+    uv[3][:, finger] = project(take.K, take.T_cam_from_world, line.astype(np.float32)[None])[0]
+    uv[3][:, finger] += np.random.default_rng(0).normal(size=(4, 4, 2))
+    result = shared(model, take._replace(uv_px=uv))
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(result.valid)), [3])
 
 
 def test_the_elimination_is_exact():
@@ -194,11 +225,12 @@ def test_the_elimination_is_exact():
     rng = np.random.default_rng(0)
     blocks = rng.normal(size=(4, 3, 3))
     blocks = (blocks @ np.swapaxes(blocks, -1, -2) + 3 * np.eye(3)).astype(np.float32)
+    coupling = rng.uniform(0.2, 1, (3, 3)).astype(np.float32)
     right = rng.normal(size=(4, 3, 2)).astype(np.float32)
-    whole = -np.eye(12, k=3) - np.eye(12, k=-3)
+    whole = -np.diag(coupling.ravel(), k=3) - np.diag(coupling.ravel(), k=-3)
     for f in range(4):
         whole[3 * f : 3 * f + 3, 3 * f : 3 * f + 3] = blocks[f]
-    chain = eliminate(jnp.asarray(blocks))
+    chain = eliminate(jnp.asarray(blocks), jnp.asarray(coupling))
     expected = np.linalg.solve(whole, right.reshape(12, 2))
     np.testing.assert_allclose(chain.solve(jnp.asarray(right)).reshape(12, 2), expected, rtol=1e-4, atol=1e-5)
     inverse = np.linalg.inv(whole).reshape(4, 3, 4, 3)
@@ -206,10 +238,10 @@ def test_the_elimination_is_exact():
     np.testing.assert_allclose(chain.covariance(), inverse, rtol=1e-4, atol=1e-5)
 
 
-def walking(take, hand):
-    """The first frame of a take, wandering as `SmoothConfig()` expects, with 2 px of noise."""
-    rng = np.random.default_rng(20)
-    walk = np.cumsum(rng.normal(size=(FRAMES, 51)), axis=0) * np.repeat([0.02, 0.005], [48, 3])
+def walking(take, hand, pace, seed=20):
+    """The first frame of a take, wandering by `pace` times the walk of `AT_REST`, with 2 px of noise."""
+    rng = np.random.default_rng(seed)
+    walk = pace * np.cumsum(rng.normal(size=(FRAMES, 51)), axis=0) * np.repeat([0.02, 0.005], [48, 3])
     pose = take.pose[:1] + walk[:, :48].reshape(-1, 16, 3)
     mesh = hand_mesh(hand, pose.astype(np.float32), take.shape, walk[:, 48:].astype(np.float32))
     uv, _ = project(take.K[None], take.T_cam_from_world[None], mesh.joints[:, None])
@@ -217,22 +249,54 @@ def walking(take, hand):
     return take._replace(uv_px=uv, pose=pose, joints=mesh.joints, vertices=mesh.vertices)
 
 
+def smoothed(model, take, mask=None):
+    mask = np.ones(take.uv_px.shape[:-1], bool) if mask is None else mask
+    config = FitConfig(smooth=AT_REST)
+    return fit(model, take.uv_px, take.K, take.T_cam_from_world, mask=mask, config=config)
+
+
 def test_the_second_pass(model, takes):
     """Nearer to the truth, surer of it with reason; and a gap is bridged, but not called valid."""
-    take = walking(takes(FRAMES, 4, 0.0, 13), model.hand)
+    take = walking(takes(FRAMES, 4, 0.0, 13), model.hand, 1.0)
     mask = np.ones(take.uv_px.shape[:-1], bool)
     mask[7] = False
-    config = FitConfig(smooth=SmoothConfig(sigma_angle=0.02, sigma_m=0.005))
-    plain = shared(model, take, mask)
-    smooth = fit(model, take.uv_px, take.K, take.T_cam_from_world, mask=mask, config=config)
+    plain, smooth = shared(model, take, mask), smoothed(model, take, mask)
     np.testing.assert_array_equal(np.flatnonzero(~np.asarray(smooth.valid)), [7])
     assert error_mm(smooth, take).mean() < 0.85 * error_mm(plain, take).mean()
     assert 1000 * np.linalg.norm(smooth.joints[7] - take.joints[7], axis=-1).max() < 12
     assert (smooth.sigma_m[7] == 0).all()
     others = np.arange(FRAMES) != 7
     assert (smooth.sigma_m[others] < plain.sigma_m[others]).all()
-    inside = np.abs(smooth.joints - take.joints)[others] < smooth.sigma_m[others][..., None]
-    assert 0.55 < inside.mean() < 0.85
+
+
+@pytest.mark.parametrize(
+    "pace", [10.0, *(pytest.param(pace, marks=pytest.mark.slow) for pace in (0.3, 1.0, 5.0))]
+)
+def test_the_second_pass_does_no_harm_at_any_pace(model, takes, pace):
+    """Ten times as fast as `SmoothConfig` says, or at rest: means of three takes.
+
+    The fast ones leave the limits of the joints, which both passes pay for.
+    """
+    ratios, calibration = [], []
+    for seed in range(3):
+        take = walking(takes(FRAMES, 4, 0.0, seed), model.hand, pace, seed)
+        plain, smooth = shared(model, take), smoothed(model, take)
+        ratios.append(error_mm(smooth, take).mean() / error_mm(plain, take).mean())
+        inside = [(np.abs(r.joints - take.joints) < r.sigma_m[..., None]).mean() for r in (smooth, plain)]
+        calibration.append(inside[0] - inside[1])
+    assert np.mean(ratios) < 1.1
+    assert abs(np.mean(calibration)) < 0.1
+
+
+def test_the_second_pass_survives_unrelated_frames_and_a_wild_one(model, takes):
+    """Of different moments, one of them another hand's: the others stay where the first pass put them."""
+    take = takes(FRAMES, 4, 1.0, 13)
+    uv = take.uv_px.copy()
+    uv[4] = draw_keypoint_take(default_hand("left"), FRAMES, 4, 1.0, 13).uv_px[4][:, ::-1]
+    plain, smooth = (f(model, take._replace(uv_px=uv)) for f in (shared, smoothed))
+    assert bool(smooth.valid.all())
+    others = np.arange(FRAMES) != 4
+    assert np.median(error_mm(smooth, take)[others]) < 1.1 * np.median(error_mm(plain, take)[others])
 
 
 def test_the_second_pass_never_raises_the_cost(model, takes):
@@ -243,17 +307,38 @@ def test_the_second_pass_never_raises_the_cost(model, takes):
     seen = TakeObservations(jnp.asarray(take.uv_px), weights, *frames, jnp.ones(4, bool))
     pose, wrist = closed_form_pose(model, take.joints, jnp.ones((4, 21), bool), jnp.zeros((4, 10)))
     begin = TakeState(pose, wrist, jnp.zeros((4, 10)))
-    motion = SmoothConfig(sigma_angle=1e-3, sigma_m=1e-4)
 
     @jax.jit
     def costs(model, state):
-        end = smooth(model, seen, state, LMConfig(), motion)
+        end, motion = smooth(model, seen, state, LMConfig(), SmoothConfig(sigma_angle=1e-3, sigma_m=1e-4))
         return tuple(take_cost(model, seen, s, LMConfig(), motion) for s in (state, end))
 
     before, after = costs(model, begin)
     assert after < before
 
 
+def test_a_shape_mode_may_be_named():
+    assert LMConfig(shape_mode="per_frame").shape_mode is ShapeMode.PER_FRAME
+    with pytest.raises(ValueError, match="frames"):
+        LMConfig(shape_mode="frames")
+    with pytest.raises(ValueError, match="PER_FRAME"):
+        FitConfig(lm=LMConfig(shape_mode=ShapeMode.PER_FRAME), smooth=SmoothConfig())
+
+
+@pytest.mark.slow
+def test_hands_of_both_sides_may_be_mapped_over(takes):
+    models = [keypoint_model(default_hand(side)) for side in ("right", "left")]
+    both = [draw_keypoint_take(default_hand(side), 8, 4, 1.0, 13) for side in ("right", "left")]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *models)
+    uv = np.stack([take.uv_px for take in both])
+    mapped = jax.jit(jax.vmap(fit_take, (0, 0, None, None)))
+    result = mapped(stacked, uv, both[0].K, both[0].T_cam_from_world)
+    for index, (model, take) in enumerate(zip(models, both, strict=True)):
+        alone = fit(model, take.uv_px, take.K, take.T_cam_from_world, config=FitConfig())
+        np.testing.assert_allclose(result.joints[index], alone.joints, atol=2e-5)
+
+
+@pytest.mark.slow
 def test_the_size_of_the_images_does_not_matter(model, takes):
     """Twice the pixels, twice the noise: the same hand."""
     take = takes(FRAMES, 4, 3.0, 13, outlier_share=0.05)
