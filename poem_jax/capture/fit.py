@@ -17,7 +17,8 @@ from tqdm import tqdm
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
-from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs, padded_frames
+from poem_jax.capture.frame_padding import padded_frames
+from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
 from poem_jax.capture.rig_file import read_rig

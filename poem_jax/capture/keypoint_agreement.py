@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.geometry.camera_checks import INVERTED
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, skew_matrix
@@ -30,7 +31,6 @@ _SUSPICIOUS_SHARE = 0.006
 """Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
 between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
 _LEAST_POINTS = 21
-_FRAMES_TOGETHER = 128
 _LEAST_GAIN = 5.0
 _MOST_FRAMES = 0.75
 """The mirror image must be likelier by e^5 in the median frame, and likelier at all in three of four."""
@@ -38,17 +38,6 @@ _FITS_NOT = 4.0
 _AGREEING = (0.75, 0.9)
 """Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
 their inverses are right."""
-
-
-def padded_frames(array: Float[Array, "frame *rest"]) -> Float[Array, "more *rest"]:
-    """Add frames in which nothing is seen (NaN), so that takes of similar length share compiled programs.
-
-    To the next power of two, beyond 128 frames to the next multiple of 128.
-    """
-    frames = len(array)
-    many = -(-frames // _FRAMES_TOGETHER) * _FRAMES_TOGETHER
-    padded = many if frames > _FRAMES_TOGETHER else 2 ** int(np.ceil(np.log2(frames)))
-    return np.concatenate([array, np.full((padded - frames, *array.shape[1:]), np.nan)])
 
 
 def epipolar_distances_px(

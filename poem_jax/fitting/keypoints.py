@@ -106,12 +106,12 @@ def triangulate_robust(
     uv, weights, K, T = _clean_inputs(uv_px, K, T_cam_from_world, confidence, mask, take_axis)
     start, inliers = _vote(uv, weights, K, T, noise.gate_px)
     points = _refine(start, uv, weights * inliers, K, T)
-    sigma = _first_noise(points, uv, weights * inliers, K, T, take_axis, noise)
+    sigma = _noise(*_residuals(points, uv, weights * inliers, K, T), take_axis, noise, by_median=True)
     inliers = _agreeing(points, uv, weights, K, T, _GATE_SIGMAS * sigma, noise.gate_px)
     inliers = inliers & (jnp.sum(inliers, -2, keepdims=True) >= _FEWEST_VIEWS)
     used = weights * inliers
     points = _refine(points, uv, used, K, T)
-    sigma = _estimate_noise(points, uv, used, K, T, take_axis, noise)
+    sigma = _noise(*_residuals(points, uv, used, K, T), take_axis, noise, by_median=False)
     return _with_uncertainty(points, uv, used, K, T, sigma)
 
 
@@ -297,40 +297,6 @@ def _inverse(H: Array, solvable: Array) -> Float[Array, "*batch joint 3 3"]:
     return adjugate / jnp.maximum(determinant, _DAMPING**2) / scale
 
 
-def _first_noise(
-    points: Array,
-    uv: Array,
-    weights: Array,
-    K: Array,
-    T: Array,
-    take_axis: int | None,
-    noise: KeypointNoise,
-) -> Float[Array, "*batch"]:
-    """Estimate the noise where outliers may still be counted: from the median over joints.
-
-    The median of chi^2_k / k is about (1 - 2 / 9k)^3 (Wilson and Hilferty 1931).
-    """
-    square, freedom = _residuals(points, uv, weights, K, T)
-    per_freedom = square / jnp.maximum(freedom, 1) / (1 - 2 / (9 * jnp.maximum(freedom, 1))) ** 3
-    per_freedom = jnp.where(freedom > 0, per_freedom, jnp.nan)
-    axes = -1 if take_axis is None else (take_axis % freedom.ndim, freedom.ndim - 1)
-    if take_axis is None:
-        middle, count = jnp.nanmedian(per_freedom, axis=-1), jnp.sum(freedom, axis=-1)
-    else:
-        middle = jnp.nanmedian(per_freedom, axis=axes, keepdims=True)[..., 0]
-        count = jnp.sum(freedom, axis=axes, keepdims=True)[..., 0]
-        middle, count = (jnp.broadcast_to(x, freedom.shape[:-1]) for x in (middle, count))
-    return _with_expected(jnp.where(count > 0, middle, 0) * count, count, noise)
-
-
-def _with_expected(
-    square: Float[Array, "*batch"], freedom: Float[Array, "*batch"], noise: KeypointNoise
-) -> Float[Array, "*batch"]:
-    """Return the noise from a sum of squares and its degrees of freedom, and what was expected before."""
-    variance = (_EXPECTED_COUNT * noise.expected_px**2 + square) / (_EXPECTED_COUNT + freedom)
-    return jnp.maximum(jnp.sqrt(variance), noise.least_px)
-
-
 def _residuals(
     points: Array, uv: Array, weights: Array, K: Array, T: Array
 ) -> tuple[Float[Array, "*batch joint"], Float[Array, "*batch joint"]]:
@@ -342,20 +308,33 @@ def _residuals(
     return square, jnp.where(counted, 2 * count - 3, 0).astype(square.dtype)
 
 
-def _estimate_noise(
-    points: Array,
-    uv: Array,
-    weights: Array,
-    K: Array,
-    T: Array,
+def _noise(
+    square: Float[Array, "*batch joint"],
+    freedom: Float[Array, "*batch joint"],
     take_axis: int | None,
-    noise: KeypointNoise,
+    expected: KeypointNoise,
+    *,
+    by_median: bool,
 ) -> Float[Array, "*batch"]:
-    """Estimate the noise of one coordinate from the residuals of views that agree."""
-    square, freedom = (jnp.sum(x, axis=-1) for x in _residuals(points, uv, weights, K, T))
-    if take_axis is not None:
-        square, freedom = (jnp.sum(x, take_axis, keepdims=True) + 0 * x for x in (square, freedom))
-    return _with_expected(square, freedom, noise)
+    """Estimate the noise of one coordinate over joints and the take, together with what was expected.
+
+    Args:
+        square, freedom: of `_residuals`.
+        by_median: for residuals among which outliers may still be; else their mean. The median of chi^2_k / k
+            is about (1 - 2 / 9k)^3 (Wilson and Hilferty 1931).
+    """
+    joints = freedom.ndim - 1
+    axes = joints if take_axis is None else (take_axis % joints, joints)
+    count = jnp.sum(freedom, axis=axes, keepdims=True)
+    if by_median:
+        k = jnp.maximum(freedom, 1)
+        scaled = jnp.where(freedom > 0, square / k / (1 - 2 / (9 * k)) ** 3, jnp.nan)
+        total = count * jnp.where(count > 0, jnp.nanmedian(scaled, axis=axes, keepdims=True), 0)
+    else:
+        total = jnp.sum(square, axis=axes, keepdims=True)
+    variance = (_EXPECTED_COUNT * expected.expected_px**2 + total) / (_EXPECTED_COUNT + count)
+    sigma = jnp.maximum(jnp.sqrt(variance), expected.least_px)[..., 0]
+    return jnp.broadcast_to(sigma, freedom.shape[:-1])
 
 
 def _with_uncertainty(

@@ -156,6 +156,7 @@ def fit_take_adam(
     Returns: as `fit_take`, with `sigma_m` zero: this solver has no uncertainty.
     """
     _check(keypoints_px, K, T_cam_from_world, confidence, mask, None, given=False)
+    _check_silhouettes(silhouettes, keypoints_px.shape[:2])
     take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config.noise)
     usable = take.weights > 0
     weights = usable.astype(take.weights.dtype) if confidence is None else jnp.where(usable, confidence, 0)
@@ -202,6 +203,24 @@ def _check(
         raise ValueError(f"`shape` goes with ShapeMode.GIVEN, and only with it; got shape {shape}")
     if shape is not None and shape.shape not in ((NUM_SHAPES,), (frames, NUM_SHAPES)):
         raise ValueError(f"`shape` must have shape (10,) or ({frames}, 10); got {shape.shape}")
+
+
+def _check_silhouettes(silhouettes: SilhouetteTarget | None, frames_and_views: tuple[int, int]) -> None:
+    if silhouettes is None:
+        return
+    masks, (K, T, view_mask) = silhouettes.masks, silhouettes.cams
+    for name, array, ndim in (
+        ("masks", masks, 4),
+        ("K", K, 4),
+        ("T_cam_from_world", T, 4),
+        ("view_mask", view_mask, 2),
+    ):
+        if array is None or array.ndim != ndim or array.shape[:2] != frames_and_views:
+            got = None if array is None else array.shape
+            raise ValueError(
+                f"`silhouettes` must have leading axes (frame, view) = {frames_and_views}; got `{name}` of "
+                f"shape {got}"
+            )
 
 
 def _observe(

@@ -11,7 +11,8 @@ import pytest
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.fit import fit, hands_of, ideal_keypoints, read_keypoint_take
 from poem_jax.capture.folder import FramePaths
-from poem_jax.capture.keypoint_agreement import epipolar_distances_px, padded_frames
+from poem_jax.capture.frame_padding import padded_frames
+from poem_jax.capture.keypoint_agreement import epipolar_distances_px
 from poem_jax.capture.rig_file import write_rig
 from poem_jax.capture.take import Take
 from poem_jax.cli import main

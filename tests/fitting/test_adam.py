@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from poem_jax.fitting.anatomy import axis_angle_from_raw_quaternion
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
 from poem_jax.fitting.silhouette import SilhouetteTarget, silhouette_cross_entropy, silhouette_l1
 from poem_jax.fitting.solvers import fit_take_adam
-from poem_jax.geometry.cameras import Cameras, project
+from poem_jax.geometry.cameras import Cameras, project, resize_intrinsics
 from poem_jax.geometry.transforms import quaternion_from_rotation, rotation_from_axis_angle
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import hand_mesh
@@ -160,3 +161,27 @@ def test_silhouettes_pull_and_are_each_frames_own(model, takes, loss):
     )
     for frame in range(2):
         np.testing.assert_allclose(together.joints[frame, 0], alone(frame, 1.0).translation, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", [ADAM_300, ADAM_300_RELEASE], ids=["paper", "release"])
+def test_the_named_recipes_take_masks(model, takes, recipe):
+    """As they are named, outlines as hard as the release's: a few steps change the hand, by its masks too."""
+    take = takes(1, 2, 0.0, 4)
+    cams = Cameras(take.K[None], take.T_cam_from_world[None])
+    K = resize_intrinsics(cams.K, (720, 1280), (96, 96))
+    cams = cams._replace(K=K)
+    empty, full = (np.full((1, 2, 96, 96), value, np.float32) for value in (0, 1))
+    run = jax.jit(partial(fit_take_adam, recipe=replace(recipe, steps=5)))
+    views = (take.uv_px, take.K, take.T_cam_from_world)
+    found = [run(model, *views, silhouettes=SilhouetteTarget(masks, cams)) for masks in (empty, full)]
+    assert all(np.isfinite(result.vertices).all() for result in found)
+    assert float(jnp.abs(found[0].vertices - found[1].vertices).max()) > 1e-4
+
+
+def test_masks_of_other_frames_are_told_in_words(model, takes):
+    take = takes(2, 3, 0.0, 3)
+    cams = Cameras(take.K, take.T_cam_from_world)
+    target = SilhouetteTarget(np.zeros((2, 3, 8, 8), np.float32), cams)
+    with pytest.raises(ValueError, match=r"\(frame, view\) = \(2, 3\); got `K` of shape \(3, 3, 3\)"):
+        fit_take_adam(model, take.uv_px, take.K, take.T_cam_from_world, silhouettes=target)
