@@ -15,9 +15,10 @@ import numpy as np
 from tqdm import tqdm
 
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
-from poem_jax.capture.folder import FramePaths, read_image
+from poem_jax.capture.folder import FramePaths
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS
+from poem_jax.io.images import read_image
 from poem_jax.typing import Array, Float, UInt8
 
 HOW_TO_GET_DETECTION = "finding hands in images needs MediaPipe: pip install 'poem-jax[detect]'"

@@ -3,7 +3,7 @@
     DIR/<camera>.jpg                    one frame
     DIR/frames/<frame>/<camera>.jpg     a take
 
-`.jpg`, `.jpeg` and `.png` in either case. Images are RGB uint8 and raw: distorted, as the camera gave them.
+`.jpg`, `.jpeg` and `.png` in either case; the images are raw: distorted, as the camera gave them.
 """
 
 import os
@@ -12,15 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-import numpy as np
-
-from poem_jax.typing import Array, UInt8
-
 SUFFIXES = (".jpg", ".jpeg", ".png")
 SINGLE_FRAME = "0000"
 """Name of the only frame of a capture without `frames/`."""
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 
 class FramePaths(NamedTuple):
@@ -52,39 +46,6 @@ def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[
             f"frames/<frame>/{camera_names[0]}.jpg"
         )
     return frames
-
-
-def read_image(path: str | os.PathLike, size_wh: tuple[int, int]) -> UInt8[Array, "h w 3"]:
-    """Read an RGB image and check that it is of the size for which the camera was calibrated.
-
-    Raises:
-        FileNotFoundError: No such file.
-        ValueError: It cannot be decoded, or has another size than the rig says.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no image at {path}")
-    data = path.read_bytes()
-    bgr = _decode(data)
-    if bgr is None:
-        raise ValueError(
-            f"{path} cannot be read as an image ({len(data)} bytes): it is damaged or of another kind"
-        )
-    height, width = bgr.shape[:2]
-    if (width, height) != tuple(size_wh):
-        raise ValueError(
-            f"{path} is {width} x {height}; the rig was calibrated at {size_wh[0]} x {size_wh[1]}: "
-            "use the images as calibrated, or scale `K`, width and height in the rig"
-        )
-    return np.ascontiguousarray(bgr[..., ::-1])
-
-
-def _decode(data: bytes) -> UInt8[Array, "h w 3"] | None:
-    """Decode to BGR; None where that fails, also for a JPEG that breaks off (OpenCV would give a part)."""
-    if not data or (data.startswith(_JPEG_START) and data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN)):
-        return None
-    # The calibration belongs to the stored pixels: a rotation flag must not turn them.
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def _images(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:

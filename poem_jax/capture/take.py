@@ -13,11 +13,12 @@ from poem_jax.capture.boxes_file import (
     read_boxes,
     without_boxes_outside,
 )
-from poem_jax.capture.folder import FramePaths, find_frames, read_image
+from poem_jax.capture.folder import FramePaths, find_frames
 from poem_jax.capture.rig_file import read_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
+from poem_jax.io.images import read_image
 from poem_jax.typing import Array, Bool, Float, UInt8
 
 RIG_FILES = ("rig.json", "calibration/rig.json")

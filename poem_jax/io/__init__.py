@@ -1,1 +1,1 @@
-"""Files: untrusted pickles and meshes."""
+"""Files: names, images, arrays, JSON, meshes, untrusted pickles; read within bounds, written whole."""

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from poem_jax.capture.folder import SINGLE_FRAME, find_frames, read_image
+from poem_jax.capture.folder import SINGLE_FRAME, find_frames
+from poem_jax.io.images import read_image
 
 CAMERAS = ("a", "b")
 

@@ -3,10 +3,11 @@
 import numpy as np
 
 from poem_jax.capture.boxes_file import read_boxes
-from poem_jax.capture.folder import find_frames, read_image
+from poem_jax.capture.folder import find_frames
 from poem_jax.capture.samples import HandResult, make_sample, mirror_result, mirror_sample
 from poem_jax.geometry.cameras import project
 from poem_jax.hand.model import hand_mesh, mirror
+from poem_jax.io.images import read_image
 
 HW = (64, 64)
 
