@@ -146,7 +146,7 @@ class Detect:
         from poem_jax.capture.boxes_file import write_boxes
         from poem_jax.capture.detect import detect_hands
         from poem_jax.capture.folder import find_frames
-        from poem_jax.capture.take import find_rig
+        from poem_jax.capture.rig_file import find_rig
 
         rig = find_rig(self.folder, self.rig)
         hands = detect_hands(find_frames(self.folder, rig.names), rig)

@@ -24,6 +24,7 @@ FLOORS = {
     "losses": 5,
     "batch": 4,
     "hand": 4,
+    "calibration": 3,
     "render": 3,
     "geometry": 2,
     "io": 1,

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.demo import GROUND_TRUTH, demo_folder
 from poem_jax.capture.outputs import write_arrays
-from poem_jax.capture.rig_file import write_rig
 from poem_jax.data.transforms import box_from_center
 from poem_jax.geometry.cameras import crop_homography, crop_intrinsics, invert_intrinsics, project
 from poem_jax.geometry.rig import Rig

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from poem_jax.capture.rig_file import HALF_PIXEL
+from poem_jax.geometry.rig import HALF_PIXEL
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.io.atomic import whole_file
 from poem_jax.typing import Array, Float, Int

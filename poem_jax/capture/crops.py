@@ -59,7 +59,7 @@ def crop_cameras(hands: HandBoxes, rig: Rig, out_hw: tuple[int, int]) -> Cameras
 def crop_hand(
     image: UInt8[Array, "h w 3"],
     K: Float[Array, "3 3"],
-    dist: Float[Array, "5"],
+    dist: Float[Array, " term"],
     box_px: Float[Array, "4"],
     out_hw: tuple[int, int],
 ) -> Crop:

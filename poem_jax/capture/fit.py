@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from poem_jax.calibration.rig_json import read_rig
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
@@ -21,7 +22,6 @@ from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
-from poem_jax.capture.rig_file import read_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.capture.take import FrameOutcome, HandOutcome, Take, read_frame
 from poem_jax.geometry.distortion import distort_pixels, undistort_pixels

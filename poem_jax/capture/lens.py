@@ -48,7 +48,7 @@ def project_raw(
 
 
 def _shows(
-    dist: Float[Array, "5"], rays: Float[Array, "point 2"], bent: Float[Array, "point 2"]
+    dist: Float[Array, " term"], rays: Float[Array, "point 2"], bent: Float[Array, "point 2"]
 ) -> Bool[Array, " point"]:
     """Tell which rays come back from where the lens images them; beyond its fold none do."""
     return np.linalg.norm(undistort(bent, dist) - rays, axis=-1) < _ROUND_TRIP_TOLERANCE
@@ -66,7 +66,7 @@ class PictureMap(NamedTuple):
 
 def picture_map(
     K: Float[Array, "3 3"],
-    dist: Float[Array, "5"],
+    dist: Float[Array, " term"],
     K_picture: Float[Array, "3 3"],
     hw: tuple[int, int],
     step: float,
@@ -78,7 +78,7 @@ def picture_map(
 
     Args:
         K: Intrinsics of the photographs.
-        dist: Their distortion k1 k2 p1 p2 k3.
+        dist: Their distortion, the 5 or 8 terms of `geometry.distortion`.
         K_picture: Intrinsics of the picture wanted.
         hw: Size of the picture wanted.
         step: Raw pixels per picture pixel; above 1 several samples per pixel are averaged, as otherwise

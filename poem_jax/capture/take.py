@@ -14,14 +14,13 @@ from poem_jax.capture.boxes_file import (
     without_boxes_outside,
 )
 from poem_jax.capture.folder import FramePaths, find_frames
-from poem_jax.capture.rig_file import read_rig
+from poem_jax.capture.rig_file import find_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
 from poem_jax.io.images import read_image
 from poem_jax.typing import Array, Bool, Float, UInt8
 
-RIG_FILES = ("rig.json", "calibration/rig.json")
 BOXES_FILES = ("boxes.npz",)
 
 
@@ -110,15 +109,6 @@ def read_take(
     names = tuple(frame.name for frame in frames)
     hands = align_frames(read_boxes(boxes_file), names, found.num_views, boxes_file)
     return Take(found, frames, without_boxes_outside(hands, found.size_wh))
-
-
-def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) -> Rig:
-    """Read the rig of a capture: the given file, else `rig.json` or `calibration/rig.json` in the folder.
-
-    Raises: FileNotFoundError, ValueError: as `read_rig`.
-    """
-    hint = "no rig: pass --rig FILE, or put it there"
-    return read_rig(_given_or_found(rig, Path(folder), RIG_FILES, hint))
 
 
 def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:

@@ -8,6 +8,11 @@ import numpy as np
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.typing import Array, Float, Int
 
+HALF_PIXEL = 0.5
+"""From coordinates that count from the centre of the top-left pixel, as OpenCV and detectors do, to those in
+which the image spans [0, W] x [0, H]: added to pixels that come from a file, subtracted where they go into
+one."""
+
 
 class Rig(NamedTuple):
     """Cameras of a capture in metres and in pixels where the image spans [0, W] x [0, H].
@@ -21,8 +26,8 @@ class Rig(NamedTuple):
     """Width and height of the raw images."""
     K: Float[Array, "view 3 3"]
     """Intrinsics of the raw images."""
-    dist: Float[Array, "view 5"]
-    """k1 k2 p1 p2 k3 of `geometry.distortion`; zeros for undistorted images."""
+    dist: Float[Array, "view term"]
+    """The 5 or 8 terms of `geometry.distortion`; zeros for undistorted images."""
     T_cam_from_world: Float[Array, "view 4 4"]
 
     @property

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, write_boxes
 from poem_jax.capture.lens import project_raw
-from poem_jax.capture.rig_file import write_rig
 from poem_jax.geometry.rig import Rig
 
 BATCH = 2

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.fit import fit, hands_of, ideal_keypoints, read_keypoint_take
 from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.capture.keypoint_agreement import epipolar_distances_px
-from poem_jax.capture.rig_file import write_rig
 from poem_jax.capture.take import Take
 from poem_jax.cli import main
 from poem_jax.geometry.distortion import distort_pixels

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import Prediction
+from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture import outputs, results
 from poem_jax.capture.boxes_file import read_boxes, write_boxes
 from poem_jax.capture.engine import Engine
 from poem_jax.capture.pipeline import batch_size, reconstruct
-from poem_jax.capture.rig_file import write_rig
 from poem_jax.capture.take import hand_names, read_take
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh

@@ -8,6 +8,7 @@ from poem_jax.geometry import distortion
 DIST = np.asarray(
     [[-0.33, 0.046, -0.0043, 0.0041, 0.066], [0.1, -0.2, 0.001, -0.002, 0.05], [0.0, 0.0, 0.0, 0.0, 0.0]]
 )
+RATIONAL = np.asarray([0.5, 0.1, 0.001, -0.002, 0.01, 0.6, 0.05, 0.001])
 K = np.asarray([[900.0, 0, 620], [0, 905, 395], [0, 0, 1]])
 
 
@@ -15,7 +16,7 @@ def _points(rng, batch=()):
     return rng.uniform(-0.5, 0.5, (*batch, 9, 2))
 
 
-@pytest.mark.parametrize("dist", DIST)
+@pytest.mark.parametrize("dist", [*DIST, RATIONAL], ids=str)
 def test_equals_opencv(rng, dist):
     points = _points(rng)
     rays = np.concatenate([points, np.ones((9, 1))], axis=-1)
@@ -52,6 +53,14 @@ def test_gradients_equal_finite_differences(rng, check_gradients):
     points = _points(rng, (3,))
     check_gradients(distortion.distort, points, DIST)
     check_gradients(distortion.undistort, distortion.distort(points, DIST), DIST)
+    check_gradients(distortion.distort, points[0], RATIONAL)
+    check_gradients(distortion.undistort, distortion.distort(points[0], RATIONAL), RATIONAL)
+
+
+def test_five_terms_are_eight_of_which_the_last_are_zero(rng):
+    points = _points(rng, (3,))
+    longer = np.pad(DIST, ((0, 0), (0, 3)))
+    np.testing.assert_array_equal(distortion.distort(points, longer), distortion.distort(points, DIST))
 
 
 def test_beyond_the_fold_stays_finite():
