@@ -24,6 +24,13 @@ from poem_jax.hand.mano_file import load
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
 GOLDEN = REFERENCE / "metrics" / "official_golden.npz"
 RELEASE_GOLDEN = REFERENCE / "poem_v2" / "golden_metrics.npz"
+V1_GOLDEN = REFERENCE / "poem_v1" / "golden_transform_metrics.npz"
+V1_METRICS = {
+    **{f"metric/auc_{x}_0.0{cm}": f"auc_{x}_{10 * cm}" for x in "jv" for cm in (2, 5)},
+    **{f"metric/{p}mp{x}pe": f"{p}mp{x}pe_mm" for p in ("", "pa_") for x in "jv"},
+}
+"""What POEM v1's own evaluation gave for five predictions, by our names."""
+V1_POINTS = tuple(f"metric/{key}" for key in ("pred_joints", "gt_joints", "pred_verts", "gt_verts"))
 SETS = ("regular", "all")
 INPUT_KEYS = {"gt_joints", "gt_verts", "pred_joints", "pred_verts", "kind", "noise_sigma_m", "seed"} | {
     f"{name}_mask" for name in SETS
@@ -327,3 +334,12 @@ def test_release_alignment() -> None:
     np.testing.assert_allclose(parts["procrustes_det_R"], data["pa_det_R"], rtol=1e-6)
     errors = point_distances(parts["procrustes_joints"], gt).mean(-1)
     np.testing.assert_allclose(errors, data["pa_mpjpe_per_sample"], atol=1e-6)
+
+
+def test_the_metrics_of_poem_v1() -> None:
+    """The joints given on both sides; aligned in float32 there."""
+    data = np.load(V1_GOLDEN)
+    got = evaluate(*(data[key] for key in V1_POINTS), protocol="poem")
+    for key, name in V1_METRICS.items():
+        unit = 1000.0 if name.endswith("_mm") else 1.0
+        np.testing.assert_allclose(got[name], unit * data[key], rtol=1e-6, err_msg=key)
