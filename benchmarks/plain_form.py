@@ -1,10 +1,14 @@
 """The plain form of POEM v2: the same function as `poem_jax.models`, with nothing done for speed.
 
-The oracle of the tests and the opponent of `benchmarks/inference.py`. It is written as the paper's equations
-read and as one first writes JAX: every convolution is `lax.conv_general_dilated`, batch norm is written out,
-residual blocks follow one by one, attention has its heads inside, vector attention makes whole
-(batch, query, k, c) arrays, and neighbours come from one `lax.top_k`. Cameras, triangulation, bilinear
-sampling and the hand are those of `poem_jax`: they are not what is optimised.
+The opponent of `benchmarks/inference.py`, and the learned half of an oracle of the tests. It is written as
+the paper's equations read and as one first writes JAX: every convolution is `lax.conv_general_dilated`, batch
+norm is written out, residual blocks follow one by one, attention has its heads inside, vector attention makes
+whole (batch, query, k, c) arrays, and neighbours come from one `lax.top_k`.
+
+Cameras, triangulation, bilinear sampling and the hand in `plain_forward` are those of `poem_jax`: they are
+not what is optimised, so as an oracle it says nothing of them. `tests/models/test_plain_form.py` puts NumPy
+in their place between the learned parts (`plain_views`, `plain_aggregation`, `plain_decoder`); of `poem_jax`
+the hand model and its posing by joints remain, which have tests of their own.
 
 It takes the same `params` and `Config`, and batches in which every view is valid: no masks, no training.
 
@@ -49,7 +53,7 @@ from poem_jax.models.config import (
 from poem_jax.models.parametric import HandParameters, root_relative_mesh
 from poem_jax.models.primary_frame import enter_primary_frame
 from poem_jax.models.query_start import pose_by_joints
-from poem_jax.typing import Array, Float, Int, Num, Params
+from poem_jax.typing import Array, Bool, Float, Int, Num, Params
 
 _TEMPERATURE = 10000.0
 _FALLBACK_ROOT = (0.0, 0.0, 0.5)
@@ -91,24 +95,35 @@ def plain_forward(
     Returns: the result, and the index sets that were used.
     """
     frame = enter_primary_frame(Cameras(cams.K, cams.T_cam_from_world), root)
-    levels = plain_trunk(
-        params, normalised(images, config, params["constants"]["basis_points"].dtype), config
-    )
-    keypoints_px, heat_maps = (_by_view(x, images) for x in plain_heat_maps(params, levels, config))
-    maps = _by_view(plain_features(params, levels, config), images)
+    keypoints_px, heat_maps, maps = plain_views(params, images, config)
     joints, solved = _triangulated(keypoints_px, heat_maps, frame.cams, config)
     centre = _root(joints, solved, frame.root)
 
     tokens = plain_sampling_and_aggregation(params, maps, frame.cams, centre, config)
-    start = _start(params, joints - centre[:, None], solved, config)
+    start = plain_start(params, joints - centre[:, None], solved, config)
     moved, embeddings, found = plain_decoder(params, start, tokens, config, neighbours)
     layers = [config.basis.radius * queries for queries in moved]
     if config.decoder.output is DecoderOutput.HAND_PARAMETERS:
-        layers.append(_parametric_hand(params, embeddings, config))
+        layers.append(plain_hand(params, embeddings, config))
     to_world = frame.T_world_from_primary
     layers_world = transform_points(to_world, jnp.stack(layers) + centre[:, None])
     root_world = transform_points(to_world, centre[:, None])[:, 0]
     return PlainResult(layers_world, keypoints_px, heat_maps, root_world), found
+
+
+def plain_views(
+    params: Params, images: Num[Array, "batch view h w 3"], config: Config
+) -> tuple[
+    Float[Array, "batch view joint 2"],
+    Float[Array, "batch view joint h w"],
+    Float[Array, "batch view h w c"],
+]:
+    """Return what is computed of every view alone: key points in pixels, heat maps, feature maps."""
+    dtype = params["constants"]["basis_points"].dtype
+    levels = plain_trunk(params, normalised(images, config, dtype), config)
+    of_images = (*plain_heat_maps(params, levels, config), plain_features(params, levels, config))
+    keypoints_px, heat_maps, maps = (_by_view(x, images) for x in of_images)
+    return keypoints_px, heat_maps, maps
 
 
 def normalised(
@@ -223,10 +238,11 @@ def plain_heat_maps(
     x = _top_down(levels, w.get("branch", {}), config.backbone.strides.index(root.branch_stride))
     logits = _conv(_max_pool(x, root.pooling, root.pooling), w["to_logits"]).transpose(0, 3, 1, 2)
     heat = jnp.exp(logits) if root.activation is HeatActivation.SOFTMAX else jax.nn.sigmoid(logits)
-    heat = heat / jnp.sum(heat, (-2, -1), keepdims=True)
+    total = jnp.sum(heat, (-2, -1))
     rows, columns = (root.stride * (jnp.arange(size) + root.cell_offset) for size in heat.shape[-2:])
     u, v = jnp.einsum("ijhw,w->ij", heat, columns), jnp.einsum("ijhw,h->ij", heat, rows)
-    return jnp.stack([u, v], -1), heat
+    keypoints_px = jnp.stack([u, v], -1) / (total[..., None] + root.sum_epsilon)
+    return keypoints_px, heat / total[..., None, None]
 
 
 def plain_features(params: Params, levels: list[Array], config: Config) -> Float[Array, "image h w c"]:
@@ -272,9 +288,7 @@ def plain_sampling_and_aggregation(
     config: Config,
 ) -> Float[Array, "batch basis c"]:
     """Return the features of the basis points about `root`; all in the primary camera's frame."""
-    w = _weights(params)
-    if config.features.position_code is PositionCode.VIEW_ROW_COLUMN:
-        maps = maps + _view_row_column_code(w["features"]["position"]["mix"], maps.shape)
+    maps = plain_map_position(params, maps, config)
     points = root[:, None] + params["constants"]["basis_points"]
     uv_px, depth = project(cams.K, cams.T_cam_from_world, points[:, None])
     share = uv_px / jnp.array(config.image_hw[::-1], uv_px.dtype)
@@ -282,13 +296,31 @@ def plain_sampling_and_aggregation(
     if config.basis.behind_camera is BehindCamera.ZEROS:
         seen = (depth > 0)[..., None]
         sampled, share = jnp.where(seen, sampled, 0), jnp.where(seen, share, 0)
+    return plain_aggregation(params, sampled, share, config)
+
+
+def plain_map_position(
+    params: Params, maps: Float[Array, "batch view h w c"], config: Config
+) -> Float[Array, "batch view h w c"]:
+    """Add the position code to the feature maps, if it belongs there."""
+    if config.features.position_code is not PositionCode.VIEW_ROW_COLUMN:
+        return maps
+    return maps + _view_row_column_code(_weights(params)["features"]["position"]["mix"], maps.shape)
+
+
+def plain_aggregation(
+    params: Params,
+    sampled: Float[Array, "batch view basis c"],
+    share: Float[Array, "batch view basis 2"],
+    config: Config,
+) -> Float[Array, "batch basis c"]:
+    """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N (paper, eq. 7-8); f = sampled features.
+
+    `share` holds the projections as (u / W, v / H), whose code is added to the features if it belongs there.
+    """
+    w = _weights(params)["aggregation"]
     if config.features.position_code is PositionCode.PROJECTED_POINT:
         sampled = sampled + _sine_code(share, sampled.shape[-1])
-    return _aggregated(sampled, w["aggregation"], config)
-
-
-def _aggregated(sampled: Float[Array, "batch view basis c"], w: Weights, config: Config) -> Array:
-    """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N (paper, eq. 7-8)."""
     batch, views, points, c = sampled.shape
     if config.aggregation.layout is Layout.ROW_MAJOR:
         tokens = sampled.transpose(0, 1, 3, 2).reshape(batch, points, views, c)
@@ -354,8 +386,13 @@ def _root(joints: Array, solved: Array, known: Array | None) -> Float[Array, "ba
     return jnp.where(jnp.all(jnp.isfinite(known), -1, keepdims=True), known, root)
 
 
-def _start(params: Params, joints: Array, solved: Array, config: Config) -> Float[Array, "batch query 3"]:
-    """Return the query points before the first layer, basis radii about the root."""
+def plain_start(
+    params: Params,
+    joints: Float[Array, "batch joint 3"],
+    solved: Bool[Array, "batch joint"],
+    config: Config,
+) -> Float[Array, "batch query 3"]:
+    """Return the query points before the first layer, basis radii about the root; `joints` in metres."""
     template, order = params["constants"]["template_queries"], config.decoder.query_order
     posed = jnp.broadcast_to(template, (joints.shape[0], *template.shape))
     if config.decoder.query_start is QueryStart.JOINTS:
@@ -481,8 +518,10 @@ def _offsets(e: Array, w: Weights) -> Float[Array, "batch query 3"]:
     return _two_layers(e, w["hidden"], w["offset"])
 
 
-def _parametric_hand(params: Params, e: Float[Array, "batch query c"], config: Config) -> Array:
-    """Return the query points of the hand whose pose and shape the last embeddings tell."""
+def plain_hand(
+    params: Params, e: Float[Array, "batch query c"], config: Config
+) -> Float[Array, "batch query 3"]:
+    """Return the query points of the hand whose pose and shape the last embeddings tell, about the root."""
     w, (batch, query, c) = _weights(params)["regressor"], e.shape
     by_name = config.decoder.pooling is Layout.BY_NAME
     channels = e.transpose(0, 2, 1) if by_name else e.reshape(batch, c, query)

@@ -1,6 +1,9 @@
 """Settings that hold for the whole suite."""
 
+import importlib.util
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 # Eight host devices let the tests of data-parallel training run on a CPU; JAX reads this when it starts.
@@ -10,6 +13,22 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("PJRT_NPROC", "32")
 
 import pytest
+
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
+_own_cache: str | None = None
+if _CACHE not in os.environ and importlib.util.find_spec("filelock"):
+    # What compiles in more than 0.2 s is compiled once a run, whichever worker or command needs it first.
+    # A limit of the size makes JAX lock the folder, so that nobody reads a program half written.
+    _own_cache = os.environ[_CACHE] = tempfile.mkdtemp(prefix="poem-tests-xla-")
+    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**33)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+
+
+def pytest_unconfigure() -> None:
+    """Remove the compiled programs; workers found the folder made, and leave it."""
+    if _own_cache is not None:
+        shutil.rmtree(_own_cache, ignore_errors=True)
+
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -1,27 +1,33 @@
-"""The optimised forms compute what the plain form of `benchmarks/plain_form.py` does."""
+"""`apply` and `infer` compute what the plain form does with geometry written anew in NumPy.
+
+The oracle shares no projection, triangulation, sampling or change of frame with the package
+(`numpy_geometry.py`), and its learned parts are those of `benchmarks/plain_form.py`. What it shares: the hand
+model and its posing by joints, tested in `tests/hand` and `test_query_start.py`.
+"""
 
 import functools
 import importlib.util
-import itertools
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.geometry.neighbours import farthest_points, gather
+from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.template import default_hand
-from poem_jax.hand.topology import NUM_QUERIES
+from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
 from poem_jax.models import inference, poem
-from poem_jax.models.config import DecoderOutput, FirstNeighbours
+from poem_jax.models.config import BehindCamera, DecoderOutput, FirstNeighbours, ViewWeights
 from poem_jax.models.presets import TINY, V2_MEDIUM_RELEASE, preset
 from poem_jax.models.reconstruction import template_queries
-from poem_jax.models.vector_attention import Neighbours
+from tests.models import numpy_geometry
 
 FILE = Path(__file__).resolve().parents[2] / "benchmarks" / "plain_form.py"
 VIEWS = 3
+LARGEST_M = 1e-7
+"""Farthest that a query point may be from the oracle's, float64."""
 
 
 @pytest.fixture(scope="module")
@@ -83,99 +89,158 @@ def _like_tiny(micro):
     return replace(micro, root=TINY.root, aggregation=TINY.aggregation, decoder=decoder)
 
 
-@pytest.fixture
-def compare(plain_form, make_params, make_scene, monkeypatch):
-    """Return the largest distances (metres) of `apply` and `infer` from the plain form."""
+class Oracle(NamedTuple):
+    """What the network should give; world, metres, as `Prediction` has it."""
 
-    def compare(config, views=VIEWS, seed=0, dtype=np.float32) -> list[float]:
-        params = _complete(_damped(make_params(config)), config)
-        images, cams = make_scene(1, views, seed, config.image_hw)
-        root = np.full((1, 3), 0.01, np.float32)
-        params, cams, root = (_cast(tree, dtype) for tree in (params, cams, root))
-        expected, found = _plain(plain_form, config)(params, images, cams, root=root)
-        assert np.isfinite(expected.layers).all()
-        _hand_back(monkeypatch, found)
-        apart = []
-        for result in (
-            poem.apply(params, images, cams, config=config, root_world=root),
-            inference.infer(inference.prepare(params, config), images, cams, root_world=root),
-        ):
-            np.testing.assert_allclose(result.keypoints_px, expected.keypoints_px, atol=1e-3)
-            np.testing.assert_allclose(result.heat_maps, expected.heat_maps, atol=1e-5)
-            apart.append(np.linalg.norm(result.layers_world - expected.layers, axis=-1).max())
+    layers: np.ndarray
+    keypoints_px: np.ndarray
+    heat_maps: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def oracle(plain_form):
+    """The learned parts of the plain form, with the geometry between them in NumPy."""
+
+    def run(config, params, images, cams, root_world) -> Oracle:
+        part = {name: _plain(plain_form, name, config) for name in LEARNED}
+        keypoints_px, heat_maps, maps = map(np.asarray, part["views"](params, images))
+        maps = np.asarray(part["map_position"](params, maps))
+        samples = zip(keypoints_px, heat_maps, maps, cams.K, cams.T_cam_from_world, root_world, strict=True)
+        scenes = [_scene(config, params, *sample) for sample in samples]
+        joints, solved, root, sampled, share = (np.stack(leaves) for leaves in zip(*scenes, strict=True))
+        tokens = part["aggregation"](params, sampled, share)
+        start = part["start"](params, joints - root[:, None], solved)
+        moved, embeddings, _ = part["decoder"](params, start, tokens)
+        layers = [config.basis.radius * np.asarray(queries) for queries in moved]
+        if config.decoder.output is DecoderOutput.HAND_PARAMETERS:
+            layers.append(np.asarray(part["hand"](params, embeddings)))
+        to_world = [np.linalg.inv(T[0]) for T in cams.T_cam_from_world]
+        in_world = [
+            [numpy_geometry.move(T, layer[i] + root[i]) for layer in layers] for i, T in enumerate(to_world)
+        ]
+        return Oracle(np.array(in_world), keypoints_px, heat_maps)
+
+    return run
+
+
+LEARNED = ("views", "map_position", "aggregation", "start", "decoder", "hand")
+
+
+def _scene(config, params, keypoints_px, heat_maps, maps, K, T_cam_from_world, root_world) -> tuple:
+    """One sample's geometry in the first camera's frame: joints, which are solved, root, samples, shares."""
+    T = np.array([t @ np.linalg.inv(T_cam_from_world[0]) for t in T_cam_from_world])
+    weights = None
+    if config.root.view_weights is ViewWeights.HEAT_SPREAD:
+        spreads = np.array([[numpy_geometry.spread(heat) for heat in view] for view in heat_maps])
+        weights = 1 / np.maximum(spreads, numpy_geometry.SHARPEST_MAP)
+    joints, solved = numpy_geometry.lift_all(keypoints_px, K, T, weights, unit_rows=config.root.unit_rows)
+    index = ROOT_JOINT if len(joints) > 1 else 0
+    root = joints[index] if solved[index] else numpy_geometry.FALLBACK_ROOT
+    if np.isfinite(root_world).all():
+        root = numpy_geometry.move(T_cam_from_world[0], root_world)
+    points = root + params["constants"]["basis_points"]
+    zeros_behind = config.basis.behind_camera is BehindCamera.ZEROS
+    samples = numpy_geometry.sample_views(maps, K, T, points, config.image_hw, zeros_behind=zeros_behind)
+    return joints, solved, root, *samples
+
+
+@pytest.fixture
+def compare(oracle, make_params, make_scene):
+    """Return the largest distances (metres) of `apply` and `infer` from the oracle.
+
+    All in float64: neighbours are then the same but for exact ties, so that nothing need be told of them.
+    """
+
+    def compare(config, views=VIEWS, seed=0, root=(0.01, 0.01, 0.01)) -> list[float]:
+        with jax.enable_x64(True):
+            params = _float64(_complete(_damped(make_params(config)), config))
+            images, cams = make_scene(1, views, seed, config.image_hw)
+            cams, root = _float64(cams), np.array([root])
+            expected = oracle(config, params, images, cams, root)
+            assert np.isfinite(expected.layers).all()
+            apart = []
+            for result in (
+                poem.apply(params, images, cams, config=config, root_world=root),
+                inference.infer(inference.prepare(params, config), images, cams, root_world=root),
+            ):
+                np.testing.assert_allclose(result.keypoints_px, expected.keypoints_px, atol=1e-7)
+                np.testing.assert_allclose(result.heat_maps, expected.heat_maps, atol=1e-10)
+                apart.append(np.linalg.norm(_layers(result) - expected.layers, axis=-1).max())
         print(f"{[f'{distance:.1e}' for distance in apart]} m")
         return apart
 
-    yield compare
-    _forget_programs()
+    return compare
 
 
-def _cast(tree, dtype):
+def _layers(result) -> np.ndarray:
+    return np.moveaxis(result.layers_world, 0, 1)
+
+
+def _float64(tree):
     arrays = jax.tree.map(np.asarray, tree)
-    return jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, arrays)
+    return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, arrays)
 
 
-def _plain(plain_form, config):
-    """The plain form, compiled without optimisation, which is quicker."""
+def _plain(plain_form, part, config):
+    """A part of the plain form, compiled without optimisation, which is quicker."""
     return jax.jit(
-        functools.partial(plain_form.plain_forward, config=config),
+        functools.partial(getattr(plain_form, f"plain_{part}"), config=config),
         compiler_options={"xla_backend_optimization_level": 0},
     )
 
 
-def _hand_back(monkeypatch, found) -> None:
-    """Let the optimised form read the neighbours that the plain form found: a rounding may choose others."""
-    _forget_programs()
-    sets = itertools.cycle(found)
-
-    def nearest_neighbours(queries, points, k) -> Neighbours:
-        index = next(sets)
-        assert index.shape == (*queries.shape[:2], k)
-        return Neighbours(jnp.moveaxis(index, -1, 0), jnp.moveaxis(gather(points, index), 2, 0))
-
-    monkeypatch.setattr("poem_jax.models.decoder.nearest_neighbours", nearest_neighbours)
-
-
-def _forget_programs() -> None:
-    """Programs hold the neighbours that they were traced with."""
-    poem._predict.clear_cache()
-    inference._find.clear_cache()
-    inference._one_thread.cache_clear()
-
-
 def test_paper(compare, micro_config):
-    assert max(compare(micro_config)) < 1e-5
+    assert max(compare(micro_config)) < LARGEST_M
 
 
 @pytest.mark.parity
 def test_paper_hrnet(compare, hrnet_config):
-    assert max(compare(hrnet_config)) < 1e-5
+    assert max(compare(hrnet_config)) < LARGEST_M
 
 
 @pytest.mark.parity
 def test_paper_parametric(compare, parametric_config):
-    assert max(compare(parametric_config)) < 1e-5
+    assert max(compare(parametric_config)) < LARGEST_M
 
 
 def test_release(compare, micro_config):
-    assert max(compare(_like_release(micro_config))) < 1e-5
+    assert max(compare(_like_release(micro_config))) < LARGEST_M
 
 
 @pytest.mark.parity
 def test_release_parametric_of_one_view(compare, micro_config):
     config = _like_release(micro_config, DecoderOutput.HAND_PARAMETERS)
-    assert max(compare(config, views=1)) < 1e-5
+    assert max(compare(config, views=1)) < LARGEST_M
 
 
 def test_tiny(compare, micro_config):
-    """In float64: its queries start at triangulated joints, which random heat maps determine badly."""
-    with jax.enable_x64(True):
-        assert max(compare(_like_tiny(micro_config), dtype=np.float64)) < 1e-7
+    """Its queries start at triangulated joints, which also give the root."""
+    unknown = (np.nan, np.nan, np.nan)
+    assert max(compare(_like_tiny(micro_config))) < LARGEST_M
+    assert max(compare(_like_tiny(micro_config), root=unknown)) < LARGEST_M
+
+
+@pytest.mark.parity
+@pytest.mark.parametrize("like", [lambda micro: micro, _like_release], ids=["paper", "release"])
+def test_float32_is_off_by_rounding(plain_form, micro_config, make_params, make_scene, like):
+    """Against the plain form's own geometry; a rounding may choose other neighbours for single queries."""
+    config = like(micro_config)
+    params = _complete(_damped(make_params(config)), config)
+    images, cams = make_scene(1, VIEWS, 0, config.image_hw)
+    root = np.full((1, 3), 0.01, np.float32)
+    expected, _ = _plain(plain_form, "forward", config)(params, images, cams, root=root)
+    for result in (
+        poem.apply(params, images, cams, config=config, root_world=root),
+        inference.infer(inference.prepare(params, config), images, cams, root_world=root),
+    ):
+        apart = np.linalg.norm(_layers(result) - np.moveaxis(expected.layers, 0, 1), axis=-1)
+        assert np.mean(apart < 1e-5) > 0.995
+        assert np.median(apart) < 2e-6
 
 
 def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_scene):
     params, (images, cams) = make_params(micro_config), make_scene(2, VIEWS)
-    run = _plain(plain_form, micro_config)
+    run = _plain(plain_form, "forward", micro_config)
     expected, found = run(params, images, cams)
     again, used = run(params, images, cams, neighbours=found)
     np.testing.assert_array_equal(found, used)
@@ -185,10 +250,6 @@ def test_neighbours_may_be_given(plain_form, micro_config, make_params, make_sce
 
 
 @pytest.mark.parity
-@pytest.mark.parametrize(
-    ("name", "largest"),
-    [("v2-base", 1e-5), ("v2-medium-release", 1e-5), ("v2-medium-mano-release", 1e-4)],
-)
-def test_full_size(compare, name, largest):
-    config = preset(name)
-    assert max(compare(config, views=2)) < largest
+@pytest.mark.parametrize("name", ["v2-base", "v2-medium-release", "v2-medium-mano-release"])
+def test_full_size(compare, name):
+    assert max(compare(preset(name), views=2)) < LARGEST_M
