@@ -13,7 +13,6 @@ spans [0, W] x [0, H]. So the principal point moves by half a pixel here, and no
 import json
 import logging
 import os
-import unicodedata
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,8 @@ from poem_jax.calibration.camera_values import (
 from poem_jax.geometry.camera_checks import rotation_error
 from poem_jax.geometry.rig import HALF_PIXEL, Rig
 from poem_jax.io.atomic import whole_file
+from poem_jax.io.file_names import name_key, safe_file_names
+from poem_jax.io.json_file import read_json
 from poem_jax.typing import Array
 
 METRES_PER_UNIT = {"metre": 1.0, "centimetre": 1e-2, "millimetre": 1e-3}
@@ -61,13 +62,15 @@ def read_rig(path: str | os.PathLike) -> Rig:
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: Not JSON, a key is missing, the unit is missing or unknown, a name or a camera comes
-            twice, a value is not finite, `R` is no rotation, `K` belongs to another resolution, or a key says
-            something of the lens that is not read. The message names file, camera, what was expected and what
-            was found.
+        ValueError: Not JSON, a key comes twice or is missing, the unit is missing or unknown, a name or a
+            camera comes twice, a value is not finite, `R` is no rotation, `K` belongs to another resolution,
+            or a key says something of the lens that is not read. The message names file,
+            camera, what was expected and what was found.
     """
     path = Path(path)
-    content = _json(path)
+    content = read_json(path, what="rig file", allow_nan=True)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold a JSON object with `unit` and `cameras`; got {short(content)}")
     check_lens_keys(content, str(path))
     scale = METRES_PER_UNIT[_unit(content, path)]
     cameras = content.get("cameras")
@@ -114,18 +117,6 @@ def write_rig(path: str | os.PathLike, rig: Rig) -> Path:
     return Path(path)
 
 
-def _json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise FileNotFoundError(f"no rig file at {path}")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except ValueError as error:
-        raise ValueError(f"{path} must be a rig in JSON; it cannot be parsed: {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a JSON object with `unit` and `cameras`; got {short(content)}")
-    return content
-
-
 def _unit(content: dict[str, Any], path: Path) -> str:
     known = ", ".join(METRES_PER_UNIT)
     if "unit" not in content:
@@ -142,16 +133,8 @@ def _unit(content: dict[str, Any], path: Path) -> str:
 def _names(cameras: list[dict[str, Any]], path: Path) -> tuple[str, ...]:
     """Return the names in Unicode's composed form, so that they meet the names of files in either form."""
     names = [_entry(camera, "name", f"{path}: camera {i}") for i, camera in enumerate(cameras)]
-    names = tuple(unicodedata.normalize("NFC", str(name)) for name in names)
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(
-            f"{path}: camera names must differ; {', '.join(map(repr, twice))} comes more than once"
-        )
-    bad = [name for name in names if not name or Path(name).name != name or name in (".", "..")]
-    if bad:
-        raise ValueError(f"{path}: a camera's name must also serve as a file name; got {bad[0]!r}")
-    return names
+    text = [str(name) if isinstance(name, str | int) else short(name) for name in names]
+    return tuple(map(name_key, safe_file_names(text, f"{path}: the cameras' names")))
 
 
 def _camera(camera: dict[str, Any], cropped: bool, where: str) -> tuple[Array, Array, Array, Array]:

@@ -6,17 +6,17 @@ kinds of npz are read:
     boxes       `boxes_px (F, H, V, 4)` x0 y0 x1 y1, NaN = unseen; `hand_side (H,)` 'left' or 'right'
     key points  `keypoints_px (F, H, V, 21, 2)` OpenPose order, NaN = unseen; `hand_side (H,)`
 
-both in pixels of the raw (distorted) images, both with an optional `frames (F,)` of names or numbers. Key
-points may have a `confidence (F, H, V, 21)`, NaN = unseen: those below `MIN_CONFIDENCE` count as unseen, and
-so do those at exactly (0, 0), where detectors put what they do not find. Key points count pixels from the
-centre of the top-left one, as detectors and calibrations do, and are moved by half a pixel here; a box gives
-edges, so that the whole image is 0 0 W H.
+both in pixels of the raw (distorted) images, both with an optional `frames (F,)` of names or numbers and an
+optional `cameras (V,)` of names, by which views in another order than the rig's are matched. Key points may
+have a `confidence (F, H, V, 21)` from 0 to 1, NaN = unseen: those below `MIN_CONFIDENCE` count as unseen, and
+so do those at exactly (0, 0) or (-1, -1), where detectors put what they do not find. Key points count pixels
+from the centre of the top-left one, as detectors and calibrations do, and are moved by half a pixel here; a
+box gives edges, so that the whole image is 0 0 W H.
 """
 
 import logging
 import os
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +25,8 @@ import numpy as np
 from poem_jax.geometry.rig import HALF_PIXEL
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.io.atomic import whole_file
+from poem_jax.io.file_names import name_key, safe_file_names
+from poem_jax.io.npz_file import read_npz
 from poem_jax.typing import Array, Float, Int
 
 SIDES = ("left", "right")
@@ -37,6 +39,11 @@ MIN_KEYPOINTS = 5
 """Fewer key points than this do not say where a hand is."""
 MIN_CONFIDENCE = 0.2
 """A key point that its detector trusts less than this is dropped; zero is below it."""
+MAX_CONFIDENCE = 1.5
+"""Detectors whose scores run from 0 to 1 pass 1 by a little; percent and logits by far."""
+NOT_FOUND = (0.0, -1.0)
+"""Where detectors put what they do not find: a key point of which both coordinates are this, a box of which
+all four are."""
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +61,8 @@ class HandBoxes(NamedTuple):
     """OpenPose order; NaN = unseen; None where the file holds boxes alone."""
     confidence: Float[Array, "frame hand view 21"] | None = None
     """Of the key points; None where the file gives none."""
+    cameras: tuple[str, ...] | None = None
+    """Names of the views as the file gives them, None where it gives none."""
 
 
 def read_boxes(path: str | os.PathLike) -> HandBoxes:
@@ -62,13 +71,13 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
     Raises:
         FileNotFoundError: No such file.
         ValueError: Not an npz, neither array is there, shapes or sides are wrong, a box is empty, a
-            confidence is negative or infinite. The message names the file, what was expected and what was
-            found.
+            confidence is not from 0 to 1, a frame's name cannot be that of a folder, a frame or a camera
+            comes twice. The message names the file, what was expected and what was found.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no boxes file at {path}; {HOW_TO_GET_BOXES}")
-    content = _arrays(path)
+    content = read_npz(path)
     sides = _sides(content, path)
     keypoints = _keypoints(content, len(sides), path)
     boxes = _boxes(content, len(sides), path)
@@ -88,7 +97,7 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
             f"got {keypoints.shape[:3]} and {boxes.shape[:3]}"
         )
     confidence = content.get("confidence") if keypoints is not None else None
-    return HandBoxes(boxes, sides, frames, keypoints, confidence)
+    return HandBoxes(boxes, sides, frames, keypoints, confidence, _cameras(content, boxes.shape[2], path))
 
 
 def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
@@ -100,6 +109,8 @@ def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
         content["keypoints_px"] = boxes.keypoints_px - HALF_PIXEL
     if boxes.confidence is not None:
         content["confidence"] = boxes.confidence
+    if boxes.cameras is not None:
+        content["cameras"] = np.array(boxes.cameras)
     # A stream, since NumPy would add a suffix to a name that has none.
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **content)
@@ -134,20 +145,43 @@ def without_boxes_outside(boxes: HandBoxes, size_wh: Int[Array, "view 2"]) -> Ha
     return boxes._replace(boxes_px=np.where(seen, boxes.boxes_px, np.nan), keypoints_px=keypoints)
 
 
-def align_frames(
-    boxes: HandBoxes, names: tuple[str, ...], num_views: int, path: str | os.PathLike
+def align_boxes(
+    boxes: HandBoxes, frames: Sequence[str], cameras: Sequence[str], path: str | os.PathLike
 ) -> HandBoxes:
-    """Return the entries of the capture's frames, in the capture's order.
+    """Return the entries of a capture's frames and cameras, in the capture's order.
 
-    Frames are matched by name, or by number ('9' is '0009'); a file without names must have as many frames as
-    the capture, and where both have but one these belong together. A frame of the capture that the file
-    does not name gets no hand.
+    Views are matched by name where the file names them; a camera that it does not name sees no hand. A file
+    that does not must have as many views as the rig, in the rig's order. Likewise the frames, which are also
+    matched by number ('9' is '0009'); where both have but one these belong together. A frame of the capture
+    that the file does not name gets no hand.
 
     Raises:
-        ValueError: The number of views or frames does not fit, or no name does.
+        ValueError: The number of views or frames does not fit, a camera of the file is not in the rig, or no
+            frame of the capture is in the file.
     """
-    if boxes.boxes_px.shape[2] != num_views:
-        raise ValueError(f"{path}: the rig has {num_views} views; the boxes have {boxes.boxes_px.shape[2]}")
+    return _align_frames(_align_views(boxes, cameras, path), tuple(frames), path)
+
+
+def _align_views(boxes: HandBoxes, cameras: Sequence[str], path: str | os.PathLike) -> HandBoxes:
+    if boxes.cameras is None:
+        if boxes.boxes_px.shape[2] != len(cameras):
+            raise ValueError(
+                f"{path}: the rig has {len(cameras)} views; the boxes have {boxes.boxes_px.shape[2]}; add "
+                "`cameras (V,)` with the cameras' names to the file to say which is which"
+            )
+        return boxes._replace(cameras=tuple(cameras))
+    row = {name_key(name): i for i, name in enumerate(boxes.cameras)}
+    unknown = row.keys() - set(map(name_key, cameras))
+    if unknown:
+        raise ValueError(
+            f"{path}: its `cameras` must be among the rig's ({', '.join(cameras)}); "
+            f"got {', '.join(sorted(unknown))}"
+        )
+    columns = np.array([row.get(name_key(name), -1) for name in cameras])
+    return _take_everywhere(boxes._replace(cameras=tuple(cameras)), columns, axis=2)
+
+
+def _align_frames(boxes: HandBoxes, names: tuple[str, ...], path: str | os.PathLike) -> HandBoxes:
     if boxes.frames is None or len(names) == len(boxes.frames) == 1:
         if len(boxes.boxes_px) != len(names):
             raise ValueError(
@@ -155,46 +189,38 @@ def align_frames(
                 "add `frames (F,)` with the frames' names to the file to say which is which"
             )
         return boxes._replace(frames=names)
-    twice = len(boxes.frames) - len({frame_key(name) for name in boxes.frames})
-    if twice:
-        raise ValueError(f"{path}: `frames` must differ from each other; got {boxes.frames[:6]}")
     row = {frame_key(name): i for i, name in enumerate(boxes.frames)}
     rows = np.array([row.get(frame_key(name), -1) for name in names])
     if (rows < 0).all():
         raise ValueError(
             f"{path}: no frame of the capture ({names[0]}, ...) is among its `frames` {boxes.frames[:4]}"
         )
-    return HandBoxes(
-        _take(boxes.boxes_px, rows),
-        boxes.hand_side,
-        names,
-        None if boxes.keypoints_px is None else _take(boxes.keypoints_px, rows),
-        None if boxes.confidence is None else _take(boxes.confidence, rows),
+    return _take_everywhere(boxes._replace(frames=names), rows, axis=0)
+
+
+def _take_everywhere(boxes: HandBoxes, rows: Array, axis: int) -> HandBoxes:
+    """Take entries of every array along an axis; NaN where the index is -1."""
+    boxes_px, keypoints_px, confidence = (
+        None if array is None else _take(array, rows, axis)
+        for array in (boxes.boxes_px, boxes.keypoints_px, boxes.confidence)
     )
+    return boxes._replace(boxes_px=boxes_px, keypoints_px=keypoints_px, confidence=confidence)
 
 
-def _take(array: Array, rows: Array) -> Array:
-    found = (rows >= 0).reshape(-1, *[1] * (array.ndim - 1))
-    return np.where(found, array[rows], np.nan)
+def _take(array: Array, rows: Array, axis: int) -> Array:
+    found = np.expand_dims(rows >= 0, tuple(i for i in range(array.ndim) if i != axis))
+    return np.where(found, array.take(rows, axis), np.nan)
 
 
 def frame_key(name: str) -> str | int:
-    """Return what makes two names those of one frame: '9' is '0009'."""
-    return int(name) if name.isdecimal() else name
-
-
-def _arrays(path: Path) -> Mapping[str, Array]:
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as content:
-            return dict(content)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, TypeError) as error:
-        raise ValueError(f"{path} must be an npz of plain arrays; it cannot be read: {error}") from error
+    """Return what makes two names those of one frame: '9' is '0009', and accents may be written two ways."""
+    return int(name) if name.isdecimal() else name_key(name)
 
 
 def _sides(content: Mapping[str, Array], path: Path) -> tuple[str, ...]:
     if "hand_side" not in content:
         raise ValueError(f"{path}: `hand_side (H,)` is missing; it says 'left' or 'right' for each hand")
-    sides = tuple(str(side) for side in np.atleast_1d(content["hand_side"]))
+    sides = tuple(side.strip().lower() for side in _texts(content["hand_side"]))
     wrong = [side for side in sides if side not in SIDES]
     if wrong or not sides:
         raise ValueError(
@@ -211,10 +237,10 @@ def _keypoints(content: Mapping[str, Array], num_hands: int, path: Path) -> Arra
     if "confidence" in content:
         trusted = _confidence(content["confidence"], keypoints.shape[:-1], path) >= MIN_CONFIDENCE
         keypoints = np.where(trusted[..., None], keypoints, np.nan)
-    at_zero = (keypoints == 0).all(-1, keepdims=True)
-    if at_zero.any():
-        _log.warning("%s: %d key points at exactly (0, 0) count as unseen", path, at_zero.sum())
-    return np.where(at_zero, np.nan, keypoints) + HALF_PIXEL
+    lost = np.any([(keypoints == value).all(-1) for value in NOT_FOUND], axis=0)
+    if lost.any():
+        _log.warning("%s: %d key points at exactly (0, 0) or (-1, -1) count as unseen", path, lost.sum())
+    return np.where(lost[..., None], np.nan, keypoints) + HALF_PIXEL
 
 
 def _confidence(confidence: Array, shape: tuple[int, ...], path: Path) -> Array:
@@ -223,26 +249,37 @@ def _confidence(confidence: Array, shape: tuple[int, ...], path: Path) -> Array:
             f"{path}: `confidence` must be numbers, one per key point, of shape {shape}; "
             f"got {confidence.dtype} {confidence.shape}"
         )
-    wrong = confidence[(confidence < 0) | np.isinf(confidence)]
-    if wrong.size:
-        raise ValueError(
-            f"{path}: `confidence` must be 0 or more, or NaN for unseen; got {wrong.flat[0]} "
-            "(put scores on a scale from 0 to 1)"
-        )
-    return confidence
+    known = confidence[~np.isnan(confidence)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if low >= 0 and high <= MAX_CONFIDENCE:
+        return confidence
+    if np.isinf([low, high]).any():
+        cause = "write NaN for unseen"
+    elif low < 0 and high > MAX_CONFIDENCE:
+        cause = "they look like logits: apply a sigmoid"
+    elif low < 0:
+        cause = "below zero are logits, or marks of what is unseen: apply a sigmoid, or write NaN"
+    else:
+        cause = "divide percent by 100, or apply a sigmoid to logits"
+    raise ValueError(
+        f"{path}: `confidence` must be from 0 to 1, or NaN for unseen; got {low:g} to {high:g}; {cause}"
+    )
 
 
 def _boxes(content: Mapping[str, Array], num_hands: int, path: Path) -> Array | None:
     if "boxes_px" not in content:
         return None
     boxes = _checked(content, "boxes_px", (num_hands, 4), path)
-    seen = np.isfinite(boxes).all(-1)
+    lost = np.any([(boxes == value).all(-1) for value in NOT_FOUND], axis=0)
+    if lost.any():
+        _log.warning("%s: %d boxes of which all numbers are 0 or -1 count as unseen", path, lost.sum())
+    seen = np.isfinite(boxes).all(-1) & ~lost
     empty = seen & (boxes[..., 2:] <= boxes[..., :2]).any(-1)
     if empty.any():
         frame, hand, view = (int(i) for i in np.argwhere(empty)[0])
         raise ValueError(
-            f"{path}: a box is x0 y0 x1 y1 with x0 < x1 and y0 < y1; got {boxes[frame, hand, view].tolist()} "
-            f"(frame {frame}, hand {hand}, view {view})"
+            f"{path}: a box is x0 y0 x1 y1 with x0 < x1 and y0 < y1 (not x y width height); got "
+            f"{boxes[frame, hand, view].tolist()} (frame {frame}, hand {hand}, view {view})"
         )
     return np.where(seen[..., None], boxes, np.nan)
 
@@ -255,15 +292,45 @@ def _checked(content: Mapping[str, Array], name: str, tail: tuple[int, ...], pat
     if not fits or not np.issubdtype(array.dtype, np.number):
         raise ValueError(
             f"{path}: `{name}` must be numbers of shape {expected}; got {array.dtype} {array.shape}"
+            f"{_layout_hint(array.shape, tail)}"
         )
     array = array.astype(np.float64)
     return np.where(np.isfinite(array), array, np.nan)
 
 
+def _layout_hint(shape: tuple[int, ...], tail: tuple[int, ...]) -> str:
+    """Return a fix for layouts that other tools write."""
+    if shape[-2:] == (NUM_JOINTS, 3) and tail[-2:] == (NUM_JOINTS, 2):
+        return "; write x and y here, and the third number, if it is a score, as `confidence`"
+    if shape[3:] == tail[1:] and shape[2] == tail[0]:
+        return "; views and hands are exchanged: use numpy.swapaxes(..., 1, 2)"
+    return ""
+
+
 def _frames(content: Mapping[str, Array], num_frames: int, path: Path) -> tuple[str, ...] | None:
     if "frames" not in content:
         return None
-    names = tuple(str(name) for name in np.atleast_1d(content["frames"]))
+    names = _texts(content["frames"])
     if len(names) != num_frames:
         raise ValueError(f"{path}: `frames` must name {num_frames} frames; got {len(names)}")
+    safe_file_names(names, f"{path}: `frames`")
+    if len({frame_key(name) for name in names}) < len(names):
+        raise ValueError(f"{path}: `frames` must differ from each other, also as numbers; got {names[:6]}")
     return names
+
+
+def _cameras(content: Mapping[str, Array], num_views: int, path: Path) -> tuple[str, ...] | None:
+    if "cameras" not in content:
+        return None
+    names = _texts(content["cameras"])
+    if len(names) != num_views:
+        raise ValueError(f"{path}: `cameras` must name {num_views} views; got {len(names)}")
+    return safe_file_names(names, f"{path}: `cameras`")
+
+
+def _texts(array: Array) -> tuple[str, ...]:
+    """Return text or numbers as text; whole floats as whole numbers."""
+    values = np.atleast_1d(array).ravel().tolist()
+    if array.dtype.kind == "S":
+        return tuple(value.decode("utf-8", "backslashreplace") for value in values)
+    return tuple(str(int(v)) if isinstance(v, float) and v.is_integer() else str(v) for v in values)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from poem_jax.calibration.rig_json import read_rig
 from poem_jax.capture.agreement import check_each_camera
-from poem_jax.capture.boxes_file import align_frames, frame_key, read_boxes, without_boxes_outside
+from poem_jax.capture.boxes_file import align_boxes, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
 from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
@@ -84,7 +84,7 @@ def read_keypoint_take(
     pictures = [] if images is None else find_frames(images, found.names)
     by_key = {frame_key(frame.name): frame for frame in pictures}
     names = hands.frames or _frame_names(len(hands.boxes_px), pictures)
-    hands = align_frames(hands, names, found.num_views, keypoints)
+    hands = align_boxes(hands, names, found.names, keypoints)
     nothing = (None,) * found.num_views
     frames = [by_key.get(frame_key(name), FramePaths(name, nothing)) for name in names]
     if len(pictures) == len(names) == 1:

@@ -3,18 +3,24 @@
     DIR/<camera>.jpg                    one frame
     DIR/frames/<frame>/<camera>.jpg     a take
 
-`.jpg`, `.jpeg` and `.png` in either case; the images are raw: distorted, as the camera gave them.
+`.jpg`, `.jpeg` and `.png` in either case; the images are raw: distorted, as the camera gave them. Folders
+that systems make beside one's own (`.ipynb_checkpoints`, `@eaDir`, `__MACOSX`) are no frames.
 """
 
+import itertools
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from poem_jax.io.file_names import name_key, safe_file_names
+
 SUFFIXES = (".jpg", ".jpeg", ".png")
 SINGLE_FRAME = "0000"
 """Name of the only frame of a capture without `frames/`."""
+_SYSTEM_PREFIXES = (".", "@", "#", "$", "__")
+"""Of folders that are not the user's: hidden, made by a network disk, an archive or an interpreter."""
 
 
 class FramePaths(NamedTuple):
@@ -30,33 +36,46 @@ def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[
 
     Raises:
         FileNotFoundError: The folder, or every camera's image in it, is missing.
-        ValueError: A camera has two images of different suffix in a frame.
+        ValueError: A camera has two images in a frame, or a frame's name cannot be that of a folder.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no capture folder at {folder}")
     if (folder / "frames").is_dir():
-        places = sorted((place for place in (folder / "frames").iterdir() if place.is_dir()), key=_natural)
-        frames = [FramePaths(place.name, _images(place, camera_names)) for place in places]
+        places = [place for place in (folder / "frames").iterdir() if place.is_dir()]
+        places = sorted((p for p in places if not p.name.startswith(_SYSTEM_PREFIXES)), key=_natural)
+        names = safe_file_names([place.name for place in places], f"{folder / 'frames'}: the frames' names")
+        frames = [
+            FramePaths(name, _images(place, camera_names)) for name, place in zip(names, places, strict=True)
+        ]
     else:
         frames = [FramePaths(SINGLE_FRAME, _images(folder, camera_names))]
     if not any(path for frame in frames for path in frame.images):
         raise FileNotFoundError(
             f"no image of the rig's cameras in {folder}: expected {camera_names[0]}.jpg (or .png), ..., or "
-            f"frames/<frame>/{camera_names[0]}.jpg"
+            f"frames/<frame>/{camera_names[0]}.jpg; found {_found(folder)}"
         )
     return frames
 
 
 def _images(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:
+    """Find every camera's image; a name's accented letters may be written in either form of Unicode."""
     found: dict[str, list[Path]] = {}
     for path in sorted(place.iterdir()):
         if path.suffix.lower() in SUFFIXES:
-            found.setdefault(path.stem, []).append(path)
-    twice = next((found[name] for name in camera_names if len(found.get(name, [])) > 1), None)
+            found.setdefault(name_key(path.stem), []).append(path)
+    by_camera = [found.get(name_key(name), []) for name in camera_names]
+    twice = next((paths for paths in by_camera if len(paths) > 1), None)
     if twice:
         raise ValueError(f"{place} holds two images of one camera: {twice[0].name} and {twice[1].name}")
-    return tuple(found[name][0] if name in found else None for name in camera_names)
+    return tuple(paths[0] if paths else None for paths in by_camera)
+
+
+def _found(folder: Path) -> str:
+    """List a few images of a capture, as paths below it, for a message."""
+    paths = (path for path in sorted(folder.glob("**/*")) if path.suffix.lower() in SUFFIXES)
+    shown = [str(path.relative_to(folder)) for path in itertools.islice(paths, 4)]
+    return ", ".join(shown[:3]) + (", ..." if len(shown) > 3 else "") or "no image"
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

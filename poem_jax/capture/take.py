@@ -9,7 +9,7 @@ import numpy as np
 from poem_jax.capture.boxes_file import (
     HOW_TO_GET_BOXES,
     HandBoxes,
-    align_frames,
+    align_boxes,
     read_boxes,
     without_boxes_outside,
 )
@@ -107,7 +107,7 @@ def read_take(
     frames = find_frames(folder, found.names)
     boxes_file = _given_or_found(boxes, folder, BOXES_FILES, HOW_TO_GET_BOXES)
     names = tuple(frame.name for frame in frames)
-    hands = align_frames(read_boxes(boxes_file), names, found.num_views, boxes_file)
+    hands = align_boxes(read_boxes(boxes_file), names, found.names, boxes_file)
     return Take(found, frames, without_boxes_outside(hands, found.size_wh))
 
 

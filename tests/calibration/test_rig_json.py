@@ -198,9 +198,12 @@ BAD = {
     ),
     "duplicate": (
         lambda c: change(c, 1, name="left_cam"),
-        "names must differ; 'left_cam' comes more than once",
+        "the cameras' names must differ from each other; 'left_cam' is both number 0 and 1",
     ),
-    "path": (lambda c: change(c, 1, name="../up"), "must also serve as a file name; got '../up'"),
+    "path": (
+        lambda c: change(c, 1, name="../up"),
+        "must also serve as the name of a file .*; got '../up'",
+    ),
     "shear": (
         lambda c: change(c, R=[[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
         r"`R` must be a rotation .* got det = 1, R R\^T off by 0\.1",
@@ -290,8 +293,11 @@ def test_wrong_files(tmp_path):
     with pytest.raises(FileNotFoundError, match="no rig file at"):
         read_rig(tmp_path / "none.json")
     (tmp_path / "text.json").write_text("cameras: 4")
-    with pytest.raises(ValueError, match=r"must be a rig in JSON; it cannot be parsed"):
+    with pytest.raises(ValueError, match=r"text.json cannot be read as JSON"):
         read_rig(tmp_path / "text.json")
+    (tmp_path / "twice.json").write_text('{"unit": "metre", "unit": "millimetre", "cameras": []}')
+    with pytest.raises(ValueError, match="the key `unit` comes more than once"):
+        read_rig(tmp_path / "twice.json")
     (tmp_path / "list.json").write_text("[1, 2]")
     with pytest.raises(ValueError, match="must hold a JSON object"):
         read_rig(tmp_path / "list.json")

@@ -1,5 +1,6 @@
 """Boxes and key points: round trip, half a pixel, frames matched by name, what is said of wrong files."""
 
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from poem_jax.capture.boxes_file import (
     MIN_CONFIDENCE,
     HandBoxes,
-    align_frames,
+    align_boxes,
     boxes_from_keypoints,
     read_boxes,
     without_boxes_outside,
@@ -57,7 +58,10 @@ def test_key_points_that_their_detector_does_not_trust_are_dropped(tmp_path, key
     low = keypoints[0, 0, 0, 3:].min(0) + 0.5
     np.testing.assert_allclose(hands.boxes_px[0, 0, 0, :2], low)
     assert np.isnan(hands.boxes_px[0, 1]).all()
-    for wrong, message in ((-confidence, "must be 0 or more"), (confidence[..., :20], r"one per key point")):
+    for wrong, message in (
+        (-confidence, "must be from 0 to 1"),
+        (confidence[..., :20], r"one per key point"),
+    ):
         with pytest.raises(ValueError, match=f"`confidence` .*{message}"):
             read_boxes(save(tmp_path / "k.npz", confidence=wrong, **content))
 
@@ -70,7 +74,74 @@ def test_key_points_written_as_zero_are_unseen(tmp_path, keypoints, caplog):
     hands = read_boxes(save(tmp_path / "k.npz", keypoints_px=keypoints, hand_side=["right", "left"]))
     np.testing.assert_allclose(hands.boxes_px[0, 0, 0], [*seen.min(0), *seen.max(0)])
     assert np.isnan(hands.boxes_px[0, 1, :2]).all()  # all zero; all at one place
-    assert "24 key points at exactly (0, 0) count as unseen" in caplog.text
+    assert "24 key points at exactly (0, 0) or (-1, -1) count as unseen" in caplog.text
+
+
+def test_key_points_and_boxes_written_as_minus_one_are_unseen(tmp_path, keypoints, caplog):
+    keypoints[0, 0, 0, :3] = -1
+    boxes = np.tile([10.0, 10, 90, 90], (3, 2, 4, 1))
+    boxes[0, 0, 1], boxes[0, 0, 2] = -1, 0
+    content = {"keypoints_px": keypoints, "boxes_px": boxes, "hand_side": ["right", "left"]}
+    hands = read_boxes(save(tmp_path / "k.npz", **content))
+    assert np.isnan(hands.keypoints_px[0, 0, 0]).all(-1).tolist() == [True] * 3 + [False] * 18
+    assert np.isfinite(hands.boxes_px[0, 0]).all(-1).tolist() == [True, False, False, True]
+    assert "3 key points at exactly (0, 0) or (-1, -1)" in caplog.text
+    assert "2 boxes of which all numbers are 0 or -1" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        (lambda p: 100 * p, "divide percent by 100"),
+        (lambda p: np.log(p / (1 - p)), "they look like logits: apply a sigmoid"),
+        (lambda p: np.log(p), "apply a sigmoid, or write NaN"),
+        (lambda p: np.where(p > 0.5, -1, p), "or write NaN"),
+        (lambda p: np.where(p > 0.5, np.inf, p), "got .* to inf; write NaN"),
+    ],
+)
+def test_confidences_on_another_scale_are_refused(tmp_path, keypoints, scale, message):
+    probability = np.random.default_rng(1).uniform(0.05, 0.99, keypoints.shape[:-1])
+    content = {"keypoints_px": keypoints, "hand_side": ["right", "left"]}
+    read_boxes(save(tmp_path / "k.npz", confidence=1.05 * probability, **content))
+    with pytest.raises(ValueError, match=f"`confidence` must be from 0 to 1, .*{message}"):
+        read_boxes(save(tmp_path / "k.npz", confidence=scale(probability), **content))
+
+
+def test_views_are_matched_by_name(tmp_path, keypoints):
+    """A file whose cameras stand in another order than the rig's gives the same hands."""
+    content = {"hand_side": ["right", "left"]}
+    names = ("a", "b", "c", "höhe")
+    straight = read_boxes(save(tmp_path / "k.npz", keypoints_px=keypoints, **content))
+    straight = align_boxes(straight, ("0", "1", "2"), names, "k.npz")
+    order = [2, 0, 3, 1]
+    turned = {
+        "keypoints_px": keypoints[:, :, order],
+        "cameras": [unicodedata.normalize("NFD", names[i]) for i in order],
+    }
+    turned = align_boxes(
+        read_boxes(save(tmp_path / "k.npz", **turned, **content)), ("0", "1", "2"), names, "k.npz"
+    )
+    assert turned.cameras == straight.cameras == names
+    np.testing.assert_array_equal(turned.keypoints_px, straight.keypoints_px)
+    np.testing.assert_array_equal(turned.boxes_px, straight.boxes_px)
+    fewer = {"keypoints_px": keypoints[:, :, [2, 0]], "cameras": ["c", "a"]}
+    fewer = align_boxes(
+        read_boxes(save(tmp_path / "k.npz", **fewer, **content)), ("0", "1", "2"), names, "k.npz"
+    )
+    np.testing.assert_array_equal(fewer.keypoints_px[:, :, [0, 2]], straight.keypoints_px[:, :, [0, 2]])
+    assert np.isnan(fewer.keypoints_px[:, :, [1, 3]]).all()
+    with pytest.raises(ValueError, match=r"k\.npz: its `cameras` must be among the rig's \(a, b\); got c"):
+        align_boxes(fewer._replace(cameras=("a", "c")), ("0", "1", "2"), ("a", "b"), "k.npz")
+    again = read_boxes(write_boxes(tmp_path / "again.npz", turned))
+    assert again.cameras == names
+
+
+@pytest.mark.parametrize("frames", [[3, 12], [3.0, 12.0], ["3", "12"], [b"3", b"12"]])
+def test_frames_as_numbers_or_text(tmp_path, keypoints, frames):
+    content = {"keypoints_px": keypoints[:2], "frames": frames, "hand_side": [b"right", b"Left"]}
+    hands = read_boxes(save(tmp_path / "k.npz", **content))
+    assert hands.frames == ("3", "12")
+    assert hands.hand_side == ("right", "left")
 
 
 def test_boxes_outside_their_image_are_unseen(caplog):
@@ -93,22 +164,20 @@ def test_any_file_name_will_do(tmp_path, keypoints):
 def test_frames_are_matched_by_name_or_number(keypoints):
     boxes = boxes_from_keypoints(keypoints)
     hands = HandBoxes(boxes, ("left", "right"), ("9", "12", "30"))
-    aligned = align_frames(hands, ("0030", "0009", "0010"), 4, "b.npz")
+    aligned = align_boxes(hands, ("0030", "0009", "0010"), "abcd", "b.npz")
     np.testing.assert_array_equal(aligned.boxes_px[0], boxes[2])
     np.testing.assert_array_equal(aligned.boxes_px[1], boxes[0])
     assert np.isnan(aligned.boxes_px[2]).all()
-    unnamed = align_frames(hands._replace(frames=None), ("x", "y", "z"), 4, "b.npz")
+    unnamed = align_boxes(hands._replace(frames=None), ("x", "y", "z"), "abcd", "b.npz")
     assert unnamed.frames == ("x", "y", "z")
     one = HandBoxes(boxes[:1], ("left", "right"), ("9",))
-    assert align_frames(one, ("0000",), 4, "b.npz").frames == ("0000",)
-    with pytest.raises(ValueError, match="`frames` must differ from each other"):
-        align_frames(hands._replace(frames=("9", "09", "30")), ("9", "12"), 4, "b.npz")
+    assert align_boxes(one, ("0000",), "abcd", "b.npz").frames == ("0000",)
     with pytest.raises(ValueError, match=r"the rig has 3 views; the boxes have 4"):
-        align_frames(hands, ("9",), 3, "b.npz")
+        align_boxes(hands, ("9",), "abc", "b.npz")
     with pytest.raises(ValueError, match=r"the capture has 2 frames, the boxes 3; add `frames"):
-        align_frames(hands._replace(frames=None), ("x", "y"), 4, "b.npz")
+        align_boxes(hands._replace(frames=None), ("x", "y"), "abcd", "b.npz")
     with pytest.raises(ValueError, match=r"no frame of the capture \(7, \.\.\.\) is among its `frames`"):
-        align_frames(hands, ("7",), 4, "b.npz")
+        align_boxes(hands, ("7",), "abcd", "b.npz")
 
 
 GOOD = {"boxes_px": np.array([[[[1.0, 2, 3, 4]]]]), "hand_side": ["right"]}
@@ -129,6 +198,29 @@ BAD = {
         r"x0 < x1 .* got \[3.0, 2.0, 1.0, 4.0\] \(frame 0",
     ),
     "frames": ({"frames": ["a", "b"]}, "`frames` must name 1 frames; got 2"),
+    "frames twice": (
+        {"boxes_px": np.tile(GOOD["boxes_px"], (2, 1, 1, 1)), "frames": ["9", "09"]},
+        "`frames` must differ from each other, also as numbers",
+    ),
+    "frames are paths": ({"frames": ["/home/me/take/000001"]}, "`frames`.* which is a path"),
+    "frames lead out": ({"frames": ["../x"]}, "`frames`.* which is a path"),
+    "frames without a name": ({"frames": [""]}, "`frames`.* which is empty"),
+    "cameras twice": (
+        {"boxes_px": np.tile(GOOD["boxes_px"], (1, 1, 2, 1)), "cameras": ["a", "a"]},
+        "`cameras` must differ from each other; 'a' is both number 0 and 1",
+    ),
+    "cameras too many": ({"cameras": ["a", "b"]}, "`cameras` must name 1 views; got 2"),
+    "complex": ({"boxes_px": GOOD["boxes_px"] + 1j}, "`boxes_px`: .* got complex numbers"),
+    "truth values": ({"boxes_px": GOOD["boxes_px"] > 2}, "`boxes_px` must be numbers"),
+    "x y w h": ({"boxes_px": np.array([[[[30.0, 20, 5, 6]]]])}, r"not x y width height\); got \[30"),
+    "scores in the third column": (
+        {"keypoints_px": np.zeros((1, 1, 1, 21, 3))},
+        "the third number, if it is a score, as `confidence`",
+    ),
+    "views before hands": (
+        {"boxes_px": np.ones((2, 4, 1, 4))},
+        r"got float64 \(2, 4, 1, 4\); views and hands are exchanged",
+    ),
     "disagree": ({"keypoints_px": np.zeros((1, 1, 2, 21, 2))}, "must agree in frames, hands and views"),
     "pickle": ({"boxes_px": np.array([{"a": 1}], dtype=object)}, "must be an npz of plain arrays"),
 }

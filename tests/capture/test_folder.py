@@ -1,5 +1,7 @@
 """Capture folders: both layouts, natural order, and what is said about missing and unreadable images."""
 
+import unicodedata
+
 import cv2
 import numpy as np
 import pytest
@@ -70,3 +72,24 @@ def test_errors(tmp_path):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(ValueError, match="cannot be read as an image"):
             read_image(tmp_path / name, (8, 6))
+
+
+@pytest.mark.parametrize("name", [".ipynb_checkpoints", ".thumbnails", "@eaDir", "#recycle", "__MACOSX"])
+def test_folders_of_the_system_are_no_frames(tmp_path, name):
+    for frame in ("frame_2", "frame_10"):
+        put(tmp_path / "frames" / frame / "a.png")
+    put(tmp_path / "frames" / name / "a.png")
+    assert [frame.name for frame in find_frames(tmp_path, CAMERAS)] == ["frame_2", "frame_10"]
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_names_meet_in_either_form_of_unicode(tmp_path, form):
+    put(tmp_path / f"{unicodedata.normalize(form, 'höhe')}.JPG")
+    (frame,) = find_frames(tmp_path, [unicodedata.normalize("NFC", "höhe")])
+    assert frame.images[0] is not None
+
+
+def test_images_of_other_names_are_listed(tmp_path):
+    put(tmp_path / "Cam0.jpg")
+    with pytest.raises(FileNotFoundError, match=r"expected a\.jpg .*; found Cam0\.jpg"):
+        find_frames(tmp_path, CAMERAS)
