@@ -21,11 +21,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from poem_jax.fitting import (
+    FitConfig,
+    FitResult,
+    Observations,
+    fit_take,
+    fit_take_adam,
+    keypoint_model,
+    triangulate_robust,
+)
 from poem_jax.fitting.adam import AdamParameters
-from poem_jax.fitting.keypoints import triangulate_robust
-from poem_jax.fitting.kinematics import keypoint_model
 from poem_jax.fitting.lm import LMConfig, ShapeMode
-from poem_jax.fitting.solvers import FitConfig, FitResult, fit_take, fit_take_adam
 from poem_jax.fitting.start import closed_form_pose
 from poem_jax.geometry.transforms import quaternion_from_rotation, rotation_from_axis_angle
 from poem_jax.geometry.triangulation import triangulate
@@ -45,9 +51,14 @@ def error_mm(result: FitResult, take: KeypointTake, what: str = "joints") -> flo
     return 1000 * float(distance[np.asarray(result.valid)].mean())
 
 
+def observed(take: KeypointTake, frames: int | None = None) -> Observations:
+    """Return what the solvers see of the first `frames` (None = all) frames."""
+    return Observations(take.uv_px[:frames], None, take.K, take.T_cam_from_world)
+
+
 def same_start(take: KeypointTake) -> AdamParameters:
     """Return `lm`'s closed-form start as Adam's parameters."""
-    points = triangulate_robust(take.uv_px, take.K, take.T_cam_from_world, take_axis=0)
+    points = triangulate_robust(observed(take), frame_axis=0)
     shape = jnp.zeros((len(take.uv_px), 10))
     pose, wrist = closed_form_pose(MODEL, points.points, points.valid, shape)
     return AdamParameters(quaternion_from_rotation(rotation_from_axis_angle(pose)), shape, wrist)
@@ -56,16 +67,15 @@ def same_start(take: KeypointTake) -> AdamParameters:
 def contestants(take: KeypointTake) -> dict[str, tuple[Callable[[], FitResult], int]]:
     """Return name -> (call, frames a call)."""
     lm, adam = jax.jit(partial(fit_take, MODEL)), jax.jit(partial(fit_take_adam, MODEL))
-    whole = (take.uv_px, take.K, take.T_cam_from_world)
-    alone = (take.uv_px[:1], take.K, take.T_cam_from_world)
+    whole, alone = observed(take), observed(take, 1)
     begin = jax.jit(lambda uv: same_start(take._replace(uv_px=uv)))(take.uv_px)
     frames = len(take.uv_px)
     return {
-        "adam-300 alone": (lambda: adam(*alone), 1),
-        "adam-300 batched": (lambda: adam(*whole), frames),
-        "adam-300 batched, same start": (lambda: adam(*whole, start=begin), frames),
-        "lm alone": (lambda: lm(*alone), 1),
-        "lm batched": (lambda: lm(*whole), frames),
+        "adam-300 alone": (lambda: adam(alone), 1),
+        "adam-300 batched": (lambda: adam(whole), frames),
+        "adam-300 batched, same start": (lambda: adam(whole, start=begin), frames),
+        "lm alone": (lambda: lm(alone), 1),
+        "lm batched": (lambda: lm(whole), frames),
     }
 
 
@@ -116,9 +126,7 @@ def error_row(
     fit: Callable[..., FitResult], take: KeypointTake, mode: ShapeMode
 ) -> tuple[float, float, float, float]:
     """Return errors of DLT, joints and vertices in mm, and the share within one sigma."""
-    result = fit(
-        take.uv_px, take.K, take.T_cam_from_world, shape=take.shape[0] if mode is ShapeMode.GIVEN else None
-    )
+    result = fit(observed(take), shape=take.shape[0] if mode is ShapeMode.GIVEN else None)
     frames = len(take.uv_px)
     K, T = (np.broadcast_to(x, (frames, *x.shape)) for x in (take.K, take.T_cam_from_world))
     dlt = 1000 * np.linalg.norm(triangulate(take.uv_px, K, T)[0] - take.joints, axis=-1).mean()

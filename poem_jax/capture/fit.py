@@ -1,11 +1,10 @@
 """From 2D key points and a rig to hand meshes: the whole of `poem fit`, which needs no network and no images.
 
-Every hand is fitted to all of its frames at once (`poem_jax.fitting.solvers`), so that its shape is one. What
+Every hand is fitted to all of its frames at once (`poem_jax.fitting.take`), so that its shape is one. What
 is wrong with the whole take - camera matrices, unit, side, order of the joints - is said once, before
 anything is written; a frame in which a hand cannot be fitted is marked, and stops nothing.
 """
 
-import functools
 import logging
 import os
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.typing import Array, Float
 
 if TYPE_CHECKING:
-    from poem_jax.fitting.solvers import FitConfig, FitResult
+    from poem_jax.fitting import FitConfig, FitResult
 
 NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by two views that agree on them"
 
@@ -149,9 +148,8 @@ def fit(
 
 def fit_config(rig: Rig, smooth: bool) -> "FitConfig":
     """Return the settings of a fit for images of the rig's size, with the second pass or without."""
-    from poem_jax.fitting.keypoints import KeypointNoise
+    from poem_jax.fitting import FitConfig, KeypointNoise
     from poem_jax.fitting.smooth import SmoothConfig
-    from poem_jax.fitting.solvers import FitConfig
 
     return FitConfig(noise=KeypointNoise.of_images(rig.size_wh), smooth=SmoothConfig() if smooth else None)
 
@@ -198,22 +196,13 @@ def _fit_hand(
 def _run(hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig") -> "FitResult":
     import jax
 
-    from poem_jax.fitting.kinematics import keypoint_model
+    from poem_jax.fitting import Observations, fit_take, keypoint_model
 
     frames = len(keypoints)
-    arrays = (padded_frames(keypoints), rig.K, rig.T_cam_from_world, padded_frames(confidence))
-    arrays = tuple(np.asarray(array, np.float32) for array in arrays)
-    fitted = jax.device_get(_program(config)(keypoint_model(hand), *arrays))
+    padded = (padded_frames(keypoints), padded_frames(confidence))
+    observations = Observations(*padded, rig.K, rig.T_cam_from_world)
+    fitted = jax.device_get(fit_take(keypoint_model(hand), observations, config=config))
     return jax.tree.map(lambda array: array[:frames], fitted)
-
-
-@functools.cache
-def _program(config: "FitConfig"):
-    import jax
-
-    from poem_jax.fitting.solvers import fit_take
-
-    return jax.jit(functools.partial(fit_take, config=config))
 
 
 def _stream(take: Take, results: list["FitResult"], progress: bool) -> Iterator[FrameResults]:

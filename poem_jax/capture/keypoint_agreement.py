@@ -16,12 +16,13 @@ from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.geometry.camera_checks import INVERTED
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, skew_matrix
+from poem_jax.geometry.world_origin import distant_origin, move_origin
 from poem_jax.hand.topology import ROOT_JOINT, WRIST
 from poem_jax.typing import Array, Float
 
 if TYPE_CHECKING:
-    from poem_jax.fitting.keypoints import KeypointNoise, RobustPoints
-    from poem_jax.fitting.solvers import FitResult
+    from poem_jax.fitting import FitResult, KeypointNoise
+    from poem_jax.fitting.robust_triangulation import RobustPoints
 
 PALM_M = (0.04, 0.16)
 """From the wrist to the middle knuckle, metres: no hand is outside."""
@@ -153,14 +154,17 @@ def _median_error(fitted: "FitResult") -> float:
 
 
 def _triangulated(rig: Rig, keypoints_px: Array) -> "RobustPoints":
-    """Triangulate (frame, hand, view, 21, 2), the noise estimated over the frames of each hand."""
+    """Triangulate (frame, hand, view, 21, 2), the noise estimated over the frames of each hand.
+
+    A far world's points come out as seen from near its cameras: only their distances matter here.
+    """
     import jax
 
-    from poem_jax.fitting.keypoints import KeypointNoise
+    from poem_jax.fitting import KeypointNoise, Observations
 
-    arrays = (padded_frames(keypoints_px), rig.K, rig.T_cam_from_world)
-    program = _program(KeypointNoise.of_images(rig.size_wh))
-    points = jax.device_get(program(*(np.asarray(array, np.float32) for array in arrays)))
+    T_cam_from_near = move_origin(rig.T_cam_from_world, distant_origin(rig.T_cam_from_world))
+    observations = Observations(padded_frames(keypoints_px), None, rig.K, T_cam_from_near)
+    points = jax.device_get(_program(KeypointNoise.of_images(rig.size_wh))(observations))
     return jax.tree.map(lambda array: array[: len(keypoints_px)], points)
 
 
@@ -168,6 +172,6 @@ def _triangulated(rig: Rig, keypoints_px: Array) -> "RobustPoints":
 def _program(noise: "KeypointNoise"):
     import jax
 
-    from poem_jax.fitting.keypoints import triangulate_robust
+    from poem_jax.fitting import triangulate_robust
 
-    return jax.jit(functools.partial(triangulate_robust, noise=noise, take_axis=0))
+    return jax.jit(functools.partial(triangulate_robust, noise=noise, frame_axis=0))

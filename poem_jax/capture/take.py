@@ -17,6 +17,7 @@ from poem_jax.capture.folder import FramePaths, find_frames
 from poem_jax.capture.rig_file import find_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.world_origin import distant_origin
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
 from poem_jax.io.images import read_image
 from poem_jax.typing import Array, Bool, Float, UInt8
@@ -177,6 +178,9 @@ def prediction_arrays(take: Take, outcomes: list[FrameOutcome]) -> dict[str, Arr
     arrays["reprojection_px"] = np.full((*counts, take.rig.num_views), np.nan, np.float32)
     arrays["views_used"] = np.zeros((*counts, take.rig.num_views), bool)
     arrays["valid"] = np.zeros(counts, bool)
+    for name in ("joints_world", "vertices_world", "root_world", "translation"):
+        if distant_origin(take.rig.T_cam_from_world).any():
+            arrays[name] = arrays[name].astype(np.float64)
     for frame, outcome in enumerate(outcomes):
         for hand, solved in enumerate(outcome.hands):
             arrays["views_used"][frame, hand] = solved.view_mask

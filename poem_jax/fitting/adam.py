@@ -18,9 +18,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from poem_jax.fitting.anatomy import anatomy_loss, anatomy_terms, rotations_from_raw_quaternions
-from poem_jax.fitting.keypoints import projection_jacobian
+from poem_jax.fitting.anatomy_loss import anatomy_loss, anatomy_terms, rotations_from_raw_quaternions
 from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints_of_rotations
+from poem_jax.fitting.observations import Observations
 from poem_jax.fitting.silhouette import (
     Masks,
     SilhouetteTarget,
@@ -28,6 +28,7 @@ from poem_jax.fitting.silhouette import (
     silhouette_l1,
     silhouette_of_views,
 )
+from poem_jax.geometry.cameras import projection_jacobian
 from poem_jax.hand.topology import WRIST
 from poem_jax.render.soft import RELEASE_SIGMA
 from poem_jax.typing import Array, Float
@@ -54,7 +55,7 @@ class AdamRecipe:
     """Steps without improvement before the rates are halved."""
     threshold: float = 1e-4
     """Relative; less than this is no improvement."""
-    least_rate: float = 1e-5
+    min_rate: float = 1e-5
     clip_norm: float | None = None
     """Bound of the gradient's norm over all parameters together."""
     accumulate: bool = False
@@ -120,10 +121,7 @@ def released_start(
 def fitting_loss(
     parameters: AdamParameters,
     model: KeypointModel,
-    uv_px: Float[Array, "view 21 2"],
-    weights: Float[Array, "view 21"],
-    K: Float[Array, "view 3 3"],
-    T_cam_from_world: Float[Array, "view 4 4"],
+    seen: Observations,
     diagonal_px: float | Array = RELEASE_DIAGONAL_PX,
     silhouettes: SilhouetteTarget | None = None,
     recipe: AdamRecipe = ADAM_300,
@@ -135,9 +133,9 @@ def fitting_loss(
     """
     rotations = rotations_from_raw_quaternions(parameters.quaternions)
     posed = pose_keypoints_of_rotations(model, rotations, parameters.shape)
-    pixels, _ = projection_jacobian(K, T_cam_from_world, posed.points + parameters.translation)
-    square = jnp.sum((pixels - uv_px) ** 2, axis=-1)
-    keypoints = jnp.mean(weights * square) / diagonal_px**2
+    pixels, _ = projection_jacobian(seen.K, seen.T_cam_from_world, posed.points + parameters.translation)
+    square = jnp.sum((pixels - seen.uv_px) ** 2, axis=-1)
+    keypoints = jnp.mean(seen.weights * square) / diagonal_px**2
     anatomy = anatomy_loss(
         anatomy_terms(
             parameters.quaternions, parameters.shape, posed.rotations, posed.points, model.hand.is_left
@@ -156,10 +154,7 @@ def fitting_loss(
 
 def adam_fit(
     model: KeypointModel,
-    uv_px: Float[Array, "view 21 2"],
-    weights: Float[Array, "view 21"],
-    K: Float[Array, "view 3 3"],
-    T_cam_from_world: Float[Array, "view 4 4"],
+    seen: Observations,
     start: AdamParameters,
     recipe: AdamRecipe = ADAM_300,
     *,
@@ -170,7 +165,7 @@ def adam_fit(
     """Fit one frame; map it over frames with `jax.vmap`.
 
     Args:
-        uv_px, weights: key points and confidences; weight zero means "ignore", the pixels must be finite.
+        seen: key points (view, 21, 2) and confidences; weight zero means "ignore", the pixels must be finite.
         start: where to begin, see `released_start`.
         recipe: static.
         diagonal_px: the unit of the key-point term, the images' diagonal.
@@ -179,8 +174,7 @@ def adam_fit(
     """
 
     def loss(parameters: AdamParameters) -> tuple[Array, Array]:
-        observed = (uv_px, weights, K, T_cam_from_world, diagonal_px)
-        return fitting_loss(parameters, model, *observed, silhouettes, recipe)
+        return fitting_loss(parameters, model, seen, diagonal_px, silhouettes, recipe)
 
     def step(state: _State, _: None) -> tuple[_State, AdamTrace | None]:
         (value, keypoints), gradient = jax.value_and_grad(loss, has_aux=True)(state.parameters)
@@ -234,5 +228,5 @@ def _plateau(state: _State, value: Array, recipe: AdamRecipe) -> tuple[Array, Ar
     best = jnp.where(better, value, state.best)
     waited = jnp.where(better, 0, state.waited[0] + 1)
     halve = waited > recipe.patience
-    rates = jnp.where(halve, jnp.maximum(0.5 * state.rates, recipe.least_rate), state.rates)
+    rates = jnp.where(halve, jnp.maximum(0.5 * state.rates, recipe.min_rate), state.rates)
     return rates, best, jnp.where(halve, 0, waited)

@@ -13,13 +13,13 @@ frame.
 
 import enum
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from poem_jax.fitting.keypoints import projection_jacobian
 from poem_jax.fitting.kinematics import (
     POSE_SIZE,
     STATE_SIZE,
@@ -28,9 +28,10 @@ from poem_jax.fitting.kinematics import (
     pose_keypoints,
     shape_jacobian,
 )
+from poem_jax.fitting.observations import Observations, point_information
 from poem_jax.fitting.residuals import (
-    LEAST_PRIOR_SIGMA,
     LIMIT_SIGMA,
+    MIN_PRIOR_SIGMA,
     anatomical_angles,
     geman_mcclure,
     geman_mcclure_weight,
@@ -44,11 +45,11 @@ from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, rotat
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS
 from poem_jax.typing import Array, Bool, Float
 
-_LEAST_DAMPING = 1e-5
+_MIN_DAMPING = 1e-5
 _FIRST_DAMPING = 1e-3
-_MOST_DAMPING = 1e4
-_LARGEST_TURN = 0.5
-_LARGEST_MOVE = 0.1
+_MAX_DAMPING = 1e4
+_MAX_TURN = 0.5
+_MAX_MOVE = 0.1
 """Bounds of one step: radians and metres."""
 
 
@@ -75,7 +76,7 @@ class LMConfig:
     """Of the pose prior; 1 takes half of each joint's range as a standard deviation."""
     limit_sigma: float = LIMIT_SIGMA
     """Radians; how softly joints are stopped beyond their limits."""
-    least_prior_sigma: float = LEAST_PRIOR_SIGMA
+    min_prior_sigma: float = MIN_PRIOR_SIGMA
     """Radians; no angle is held tighter than this by the prior."""
 
     def __post_init__(self) -> None:
@@ -83,13 +84,10 @@ class LMConfig:
 
 
 class TakeObservations(NamedTuple):
-    """Key points of a take; all finite, weights zero where a key point does not count."""
+    """The key points of a take, and the frames that count."""
 
-    uv_px: Float[Array, "frame view 21 2"]
-    weights: Float[Array, "frame view 21"]
-    """confidence / sigma_px^2."""
-    K: Float[Array, "frame view 3 3"]
-    T_cam_from_world: Float[Array, "frame view 4 4"]
+    seen: Observations
+    """Clean, with a leading axis of frames; weights are confidence / sigma_px^2, zero for outliers."""
     frame_mask: Bool[Array, "frame"]
     """False: the frame keeps its start, and says nothing about the shape, which it takes from the others."""
 
@@ -140,7 +138,7 @@ def joint_sigma(
 def conditional_covariance(equations: NormalEquations) -> Float[Array, "frame 51 51"]:
     """Return the covariance of every frame's 51 numbers given the shape: H^-1."""
     H = equations.H
-    factor = _factor(H, jnp.full(H.shape[:1], _LEAST_DAMPING, H.dtype))
+    factor = _factor(H, jnp.full(H.shape[:1], _MIN_DAMPING, H.dtype))
     return _solve(factor, jnp.broadcast_to(jnp.eye(STATE_SIZE, dtype=H.dtype), H.shape))
 
 
@@ -176,7 +174,8 @@ def normal_equations(
 ) -> NormalEquations:
     """Linearise all residuals at `state`, key points reweighted by the robust kernel of the given scale."""
     posed = pose_keypoints(model, state.pose, state.shape)
-    A, b = _joint_information(take, posed.points + state.wrist[..., None, :], scale)
+    robust = partial(geman_mcclure_weight, scale=scale)
+    A, b = point_information(posed.points + state.wrist[..., None, :], take.seen, robust)
     turn = pose_jacobian(model, posed, state.pose)
     place = jnp.broadcast_to(jnp.eye(3, dtype=turn.dtype), (*turn.shape[:-1], 3))
     D, D_shape = jnp.concatenate([turn, place], axis=-1), shape_jacobian(model, posed)
@@ -199,10 +198,10 @@ def frame_cost(
     """Return the cost of every frame without the shape's prior."""
     posed = pose_keypoints(model, state.pose, state.shape)
     joints = posed.points + state.wrist[..., None, :]
-    pixels = reprojection(joints, take.uv_px, take.weights, take.K, take.T_cam_from_world)
+    pixels = reprojection(joints, take.seen)
     data = jnp.sum(geman_mcclure(jnp.sum(pixels**2, axis=-1), scale), axis=(-2, -1))
     angles = anatomical_angles(state.pose, model.axes)
-    prior = jnp.sum(pose_prior(angles, model.limits, config.least_prior_sigma) ** 2, axis=(-2, -1))
+    prior = jnp.sum(pose_prior(angles, model.limits, config.min_prior_sigma) ** 2, axis=(-2, -1))
     limits = jnp.sum(joint_limits(angles, model.limits, config.limit_sigma) ** 2, axis=(-2, -1))
     return 0.5 * (data + config.prior_weight * prior + limits)
 
@@ -234,7 +233,7 @@ def _iteration(
         lambda new, old, take_it: jnp.where(_along(take_it, new), new, old), trial, state, chosen
     )
     damping = jnp.where((after < before) & moves, damping / 4, damping * 8)
-    return state, jnp.clip(damping, _LEAST_DAMPING, _MOST_DAMPING)
+    return state, jnp.clip(damping, _MIN_DAMPING, _MAX_DAMPING)
 
 
 def _accepted_together(
@@ -292,26 +291,14 @@ def _reduced_shape(
     return S + jnp.eye(NUM_SHAPES, dtype=S.dtype), g + shape_prior(state.shape)
 
 
-def _joint_information(
-    take: TakeObservations, joints: Float[Array, "frame 21 3"], scale: float | Array
-) -> tuple[Float[Array, "frame 21 3 3"], Float[Array, "frame 21 3"]]:
-    """Return A = sum_v w J^T J and b = sum_v w J^T r of every joint, w reweighted by the robust kernel."""
-    pixels, J = projection_jacobian(take.K, take.T_cam_from_world, joints)
-    offset = pixels - take.uv_px
-    square = take.weights * jnp.sum(offset**2, axis=-1)
-    weighted = (take.weights * geman_mcclure_weight(square, scale))[..., None, None] * J
-    A = jnp.sum(weighted[..., :, None] * J[..., None, :], axis=(-3, -5))
-    return A, jnp.sum(weighted * offset[..., None], axis=(-2, -4))
-
-
 def prior_equations(
     model: KeypointModel, state: TakeState, config: LMConfig
 ) -> tuple[Float[Array, "frame 51 51"], Float[Array, "frame 51"]]:
     """Return normal matrix and gradient of pose prior and limits, both diagonal in anatomical angles."""
     angles = anatomical_angles(state.pose, model.axes)
     excess = joint_limits(angles, model.limits, config.limit_sigma)
-    sigma = prior_sigma(model.limits, config.least_prior_sigma)
-    prior = pose_prior(angles, model.limits, config.least_prior_sigma)
+    sigma = prior_sigma(model.limits, config.min_prior_sigma)
+    prior = pose_prior(angles, model.limits, config.min_prior_sigma)
     slope = config.prior_weight * prior / sigma + excess / config.limit_sigma
     curvature = config.prior_weight / sigma**2 + (excess != 0) / config.limit_sigma**2
     g = jnp.sum(slope[..., None] * model.axes, axis=-2).reshape(-1, POSE_SIZE - 3)
@@ -343,10 +330,10 @@ def _solve(factor: _Factor, right: Float[Array, "frame 51 k"]) -> Float[Array, "
 
 def apply_step(state: TakeState, dx: Float[Array, "frame 51"], dshape: Float[Array, "frame 10"]) -> TakeState:
     """Apply a step: the wrist turns in the world, everything else adds up; long steps are cut."""
-    turn = jnp.clip(dx[:, :POSE_SIZE].reshape(-1, NUM_SKELETON_JOINTS, 3), -_LARGEST_TURN, _LARGEST_TURN)
+    turn = jnp.clip(dx[:, :POSE_SIZE].reshape(-1, NUM_SKELETON_JOINTS, 3), -_MAX_TURN, _MAX_TURN)
     R = matmul(rotation_from_axis_angle(turn[:, 0]), rotation_from_axis_angle(state.pose[:, 0]))
     pose = jnp.concatenate([axis_angle_from_rotation(R)[:, None], state.pose[:, 1:] + turn[:, 1:]], axis=1)
-    wrist = state.wrist + jnp.clip(dx[:, POSE_SIZE:], -_LARGEST_MOVE, _LARGEST_MOVE)
+    wrist = state.wrist + jnp.clip(dx[:, POSE_SIZE:], -_MAX_MOVE, _MAX_MOVE)
     return TakeState(pose, wrist, state.shape + dshape)
 
 

@@ -2,35 +2,28 @@
 
 The cost of a residual vector r is |r|^2 / 2, except where a robust kernel replaces the square. Frames: world,
 metres; pixels as in `geometry.cameras`; angles as in `hand.joint_limits`, radians. The released anatomical
-terms have a file of their own, `anatomy.py`.
+terms have a file of their own, `anatomy_loss.py`.
 """
 
 import jax.numpy as jnp
 
-from poem_jax.fitting.keypoints import projection_jacobian
+from poem_jax.fitting.observations import Observations
+from poem_jax.geometry.cameras import projection_jacobian
 from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, rotation_from_axis_angle, transpose
 from poem_jax.typing import Array, Bool, Float
 
 LIMIT_SIGMA = 0.2
 """Radians. How softly a joint is stopped beyond its limit: people differ by about this much (11 degrees)."""
-LEAST_PRIOR_SIGMA = 0.05
+MIN_PRIOR_SIGMA = 0.05
 """Radians. No angle is held tighter than this by the pose prior, however narrow its limits."""
 
 
 def reprojection(
-    joints_world: Float[Array, "*batch joint 3"],
-    uv_px: Float[Array, "*batch view joint 2"],
-    weights: Float[Array, "*batch view joint"],
-    K: Float[Array, "*#batch view 3 3"],
-    T_cam_from_world: Float[Array, "*#batch view 4 4"],
+    joints_world: Float[Array, "*batch joint 3"], seen: Observations
 ) -> Float[Array, "*batch view joint 2"]:
-    """Return projected minus observed pixels, times sqrt(weight).
-
-    Args:
-        weights: confidence / sigma_px^2; zero means "ignore" (`uv_px` must still be finite there).
-    """
-    pixels, _ = projection_jacobian(K, T_cam_from_world, joints_world)
-    return jnp.sqrt(weights)[..., None] * (pixels - uv_px)
+    """Return projected minus observed pixels, times sqrt(weight), of clean observations."""
+    pixels, _ = projection_jacobian(seen.K, seen.T_cam_from_world, joints_world)
+    return jnp.sqrt(seen.weights)[..., None] * (pixels - seen.uv_px)
 
 
 def joints_3d(
@@ -66,21 +59,19 @@ def joint_limits(
 def pose_prior(
     angles: Float[Array, "*batch 15 3"],
     limits: Float[Array, "15 3 2"],
-    least_sigma: float = LEAST_PRIOR_SIGMA,
+    min_sigma: float = MIN_PRIOR_SIGMA,
 ) -> Float[Array, "*batch 15 3"]:
     """Return the distance of each angle from the middle of its range, in halves of the range.
 
     A normal prior from the limits alone, wider than the uniform distribution between them; it needs no
     recorded poses and none of MANO's data.
     """
-    return (angles - jnp.mean(limits, axis=-1)) / prior_sigma(limits, least_sigma)
+    return (angles - jnp.mean(limits, axis=-1)) / prior_sigma(limits, min_sigma)
 
 
-def prior_sigma(
-    limits: Float[Array, "15 3 2"], least_sigma: float = LEAST_PRIOR_SIGMA
-) -> Float[Array, "15 3"]:
+def prior_sigma(limits: Float[Array, "15 3 2"], min_sigma: float = MIN_PRIOR_SIGMA) -> Float[Array, "15 3"]:
     """Return the standard deviation of the pose prior, radians."""
-    return jnp.maximum(0.5 * (limits[..., 1] - limits[..., 0]), least_sigma)
+    return jnp.maximum(0.5 * (limits[..., 1] - limits[..., 0]), min_sigma)
 
 
 def shape_prior(shape: Float[Array, "*batch 10"]) -> Float[Array, "*batch 10"]:

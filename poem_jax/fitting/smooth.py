@@ -40,8 +40,8 @@ from poem_jax.geometry.transforms import matmul, transpose
 from poem_jax.typing import Array, Float
 
 _FIRST_DAMPING = 1e-5
-_LEAST_DAMPING = 1e-6
-_MOST_DAMPING = 1e4
+_MIN_DAMPING = 1e-6
+_MAX_DAMPING = 1e4
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def smooth(
         costs = [take_cost(model, take, s, config, motion) for s in (state, trial)]
         falls = costs[1] < costs[0]
         state = jax.tree.map(lambda new, old: jnp.where(falls, new, old), trial, state)
-        damping = jnp.clip(jnp.where(falls, damping / 4, damping * 64), _LEAST_DAMPING, _MOST_DAMPING)
+        damping = jnp.clip(jnp.where(falls, damping / 4, damping * 64), _MIN_DAMPING, _MAX_DAMPING)
         return (state, damping), None
 
     begin = (state, jnp.asarray(_FIRST_DAMPING, state.pose.dtype))

@@ -15,9 +15,9 @@ from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, small
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE, WRIST
 from poem_jax.typing import Array, Bool, Float
 
-FEWEST_JOINTS = 3
+MIN_JOINTS = 3
 """Joints that a frame must have triangulated to be fitted."""
-LEAST_WIDTH_M = 0.005
+MIN_WIDTH_M = 0.005
 """And how far, root mean square, these must lie from one line: a hand could turn about it."""
 
 _SKELETON = np.array(SKELETON_FROM_OPENPOSE)
@@ -43,7 +43,7 @@ def can_be_placed(
     scatter = matmul(transpose(share * offset), offset)
     noise = jnp.sum(share[..., None] * covariance, axis=-3)
     width = jnp.linalg.eigvalsh(scatter - 3 * noise)[..., 1]
-    return (count >= FEWEST_JOINTS) & (width > LEAST_WIDTH_M**2)
+    return (count >= MIN_JOINTS) & (width > MIN_WIDTH_M**2)
 
 
 def closed_form_pose(
@@ -66,7 +66,7 @@ def closed_form_pose(
     ).points
     palm = valid & _PALM
     # The knuckles alone lie nearly on one line, about which the palm could turn.
-    enough = (jnp.sum(palm, -1) >= FEWEST_JOINTS) & jnp.any(valid & _HEEL, -1)
+    enough = (jnp.sum(palm, -1) >= MIN_JOINTS) & jnp.any(valid & _HEEL, -1)
     used = jnp.where(enough[..., None], palm, valid)
     fit = procrustes(rest, joints_world, with_scale=False, mask=used)
     joints = jnp.where(valid[..., None], joints_world, apply_similarity(fit, rest))

@@ -21,7 +21,11 @@ from poem_jax.geometry.transforms import (
 from poem_jax.typing import Array, Bool, Float, Int, array_namespace
 
 MIN_DEPTH = 1e-4
-"""Metres. Nearer to the camera's plane than this, projection divides by this depth, with the sign kept."""
+"""Metres. Projections divide by no smaller depth; its sign is kept, so that what lies behind a camera is seen
+mirrored, and a test of the depth tells it."""
+MIN_DEPTH_AHEAD = 1e-2
+"""Metres. `projection_jacobian`, on which solvers descend, counts all that is nearer, or behind, as this far
+ahead: it leads back before the camera, with slopes that stay finite."""
 
 
 class _CameraFields(NamedTuple):
@@ -68,6 +72,27 @@ def project_cam(
 ) -> Float[Array, "*#batch point 2"]:
     """Project points of the camera's own frame to pixels; see `project`."""
     return pixels_from_normalised(K, points_cam[..., :2] / _safe_depth(points_cam[..., 2:]))
+
+
+def projection_jacobian(
+    K: Float[Array, "*#batch view 3 3"],
+    T_cam_from_world: Float[Array, "*#batch view 4 4"],
+    points_world: Float[Array, "*#batch joint 3"],
+) -> tuple[Float[Array, "*batch view joint 2"], Float[Array, "*batch view joint 2 3"]]:
+    """Return the pixels of world points in every view, and their derivative by the points.
+
+    d (u, v) / d X = K_2x2 [R_xy - (x, y)/z R_z] / z (Hartley and Zisserman, section 6.2), with z at least
+    `MIN_DEPTH_AHEAD`.
+    """
+    xp = array_namespace(K, T_cam_from_world, points_world)
+    points_cam = transform_points(T_cam_from_world, points_world[..., None, :, :])
+    depth = xp.maximum(points_cam[..., 2:], MIN_DEPTH_AHEAD)
+    xy = points_cam[..., :2] / depth
+    R = T_cam_from_world[..., None, :3, :3]
+    slope = (R[..., :2, :] - xy[..., None] * R[..., 2:, :]) / depth[..., None]
+    focal = K[..., None, :2, :2]
+    pixels = xp.sum(focal * xy[..., None, :], -1) + K[..., None, :2, 2]
+    return pixels, xp.sum(focal[..., None] * slope[..., None, :, :], -2)
 
 
 def unproject(

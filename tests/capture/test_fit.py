@@ -19,6 +19,7 @@ from poem_jax.cli import main
 from poem_jax.geometry.distortion import distort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
+from poem_jax.geometry.world_origin import move_origin
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO
@@ -120,6 +121,15 @@ def test_nan_confidence_counts_as_unseen(take, tmp_path):
         for name, k in (("a", take.hands.keypoints_px), ("b", moved))
     )
     np.testing.assert_allclose(one["joints_world"], other["joints_world"], atol=1e-6)
+
+
+def test_a_world_in_map_coordinates_gives_the_same_hands(take, fitted, tmp_path):
+    origin = np.array([500e3, 4500e3, 300.0])
+    rig = take.rig._replace(T_cam_from_world=move_origin(take.rig.T_cam_from_world, -origin))
+    arrays = fit(take._replace(rig=rig), tmp_path, progress=False).arrays
+    for name in ("joints_world", "vertices_world", "root_world", "translation"):
+        assert arrays[name].dtype == np.float64
+        np.testing.assert_allclose(arrays[name] - origin, fitted.arrays[name], atol=1e-4)
 
 
 def test_millimetres_called_metres_are_refused(take, tmp_path):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.fitting import Observations, fit_take_adam
 from poem_jax.fitting.adam import (
     ADAM_300,
     ADAM_300_RELEASE,
@@ -17,15 +18,15 @@ from poem_jax.fitting.adam import (
     fitting_loss,
     released_start,
 )
-from poem_jax.fitting.anatomy import axis_angle_from_raw_quaternion
+from poem_jax.fitting.anatomy_loss import axis_angle_from_raw_quaternion
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
 from poem_jax.fitting.silhouette import SilhouetteTarget, silhouette_cross_entropy, silhouette_l1
-from poem_jax.fitting.solvers import fit_take_adam
 from poem_jax.geometry.cameras import Cameras, project, resize_intrinsics
 from poem_jax.geometry.transforms import quaternion_from_rotation, rotation_from_axis_angle
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import hand_mesh
 from poem_jax.render.zbuffer import NO_FACE, rasterise
+from tests.fitting.observed import observed
 
 STATES = {"quaternions": "hand_pose", "shape": "hand_shape", "translation": "hand_tsl"}
 
@@ -35,7 +36,7 @@ class Stored(NamedTuple):
 
     golden: dict[str, np.ndarray]
     model: KeypointModel
-    views: tuple[np.ndarray, ...]
+    seen: Observations
 
     def state(self, step: int) -> AdamParameters:
         """Return the parameters after `step` steps."""
@@ -48,8 +49,9 @@ def stored(shared_dir) -> Stored:
     folder = shared_dir / "reference" / "poem_v1"
     golden = dict(np.load(folder / "golden_fit.npz"))
     keypoints = golden["keypoints"]
-    views = (keypoints[..., :2], keypoints[..., 2], golden["cam_intr"], golden["cam_extr_master_to_cam"])
-    return Stored(golden, keypoint_model(load(folder / "fake_mano.npz")), views)
+    cameras = (golden["cam_intr"], golden["cam_extr_master_to_cam"])
+    seen = Observations(keypoints[..., :2], keypoints[..., 2], *cameras)
+    return Stored(golden, keypoint_model(load(folder / "fake_mano.npz")), seen)
 
 
 @pytest.mark.parity
@@ -64,7 +66,7 @@ def test_the_released_recipe_follows_the_release(stored):
     golden = stored.golden
     noise = (golden["init_pose"].reshape(16, 4) - np.array([1, 0, 0, 0])) / 0.1
     run = jax.jit(partial(adam_fit, recipe=ADAM_300_RELEASE, trace=True))
-    _, trace = run(stored.model, *stored.views, released_start(jnp.asarray(noise, jnp.float32)))
+    _, trace = run(stored.model, stored.seen, released_start(jnp.asarray(noise, jnp.float32)))
     assert float(trace.keypoint_loss[0]) == pytest.approx(0.14027, abs=1e-5)
     np.testing.assert_allclose(trace.keypoint_loss[:70], golden["reprojection_loss"][:70], rtol=1e-3)
     np.testing.assert_allclose(trace.rates[:246], golden["lr"][:246], rtol=1e-6)
@@ -78,7 +80,7 @@ def test_the_released_recipe_follows_the_release(stored):
 @pytest.mark.parity
 @pytest.mark.parametrize("step", [1, 2, 5, 10, 20, 50, 100, 200])
 def test_the_loss_of_every_stored_state_is_the_releases(stored, step):
-    _, keypoints = jax.jit(fitting_loss)(stored.state(step), stored.model, *stored.views)
+    _, keypoints = jax.jit(fitting_loss)(stored.state(step), stored.model, stored.seen)
     np.testing.assert_allclose(keypoints, stored.golden["reprojection_loss"][step], rtol=1e-4)
 
 
@@ -95,11 +97,10 @@ def test_the_last_stored_state_gives_the_stored_hand(stored):
 def test_the_rates_are_halved_after_the_patience(model, takes):
     """With rates too small to move anything, the first step is the best: 50 more are waited for."""
     take = takes(1, 2, 0.0, 1)
-    recipe = AdamRecipe(steps=120, rate=1e-12, shape_rate=1e-12, least_rate=0.0)
+    recipe = AdamRecipe(steps=120, rate=1e-12, shape_rate=1e-12, min_rate=0.0)
     run = jax.jit(partial(adam_fit, recipe=recipe, trace=True))
-    _, trace = run(
-        model, take.uv_px[0], np.ones((2, 21), np.float32), take.K, take.T_cam_from_world, released_start()
-    )
+    seen = observed(take, uv_px=take.uv_px[0], weights=np.ones((2, 21), np.float32))
+    _, trace = run(model, seen, released_start())
     halved = np.flatnonzero(np.diff(np.asarray(trace.rates)[:, 0])) + 1
     np.testing.assert_array_equal(halved, [52, 103])
 
@@ -114,10 +115,10 @@ def test_the_papers_recipe_lowers_the_error(model, takes):
         jnp.asarray(take.joints[:, 0] + 0.01),
     )
     flat = jax.vmap(lambda wrist: released_start(None, wrist))(jnp.asarray(take.joints[:, 0]))
-    for start, most_mm in ((flat, 45), (near, 10)):
-        result = run(model, take.uv_px, take.K, take.T_cam_from_world, start=start)
+    for start, max_mm in ((flat, 45), (near, 10)):
+        result = run(model, observed(take), start=start)
         assert bool(result.valid.all())
-        assert 1000 * np.linalg.norm(result.joints - take.joints, axis=-1).mean() < most_mm
+        assert 1000 * np.linalg.norm(result.joints - take.joints, axis=-1).mean() < max_mm
 
 
 @pytest.mark.parametrize(
@@ -150,14 +151,14 @@ def test_silhouettes_pull_and_are_each_frames_own(model, takes, loss):
     def alone(frame, weight):
         own = jax.tree.map(lambda x: x[frame], (take.uv_px, begin, target))
         weights = np.full(take.uv_px.shape[1:-1], weight, np.float32)
-        views = (weights, take.K, take.T_cam_from_world)
-        return run(model, own[0], *views, own[1], silhouettes=own[2])[0]
+        seen = observed(take, uv_px=own[0], weights=weights)
+        return run(model, seen, own[1], silhouettes=own[2])[0]
 
     for frame in range(2):
         missed = alone(frame, 0.0).translation - take.joints[frame, 0]
         assert np.linalg.norm(missed) < 0.5 * np.linalg.norm(offset)
     together = jax.jit(partial(fit_take_adam, recipe=recipe, diagonal_px=RELEASE_DIAGONAL_PX))(
-        model, take.uv_px, take.K, take.T_cam_from_world, start=begin, silhouettes=target
+        model, observed(take), start=begin, silhouettes=target
     )
     for frame in range(2):
         np.testing.assert_allclose(together.joints[frame, 0], alone(frame, 1.0).translation, atol=1e-5)
@@ -173,8 +174,7 @@ def test_the_named_recipes_take_masks(model, takes, recipe):
     cams = cams._replace(K=K)
     empty, full = (np.full((1, 2, 96, 96), value, np.float32) for value in (0, 1))
     run = jax.jit(partial(fit_take_adam, recipe=replace(recipe, steps=5)))
-    views = (take.uv_px, take.K, take.T_cam_from_world)
-    found = [run(model, *views, silhouettes=SilhouetteTarget(masks, cams)) for masks in (empty, full)]
+    found = [run(model, observed(take), silhouettes=SilhouetteTarget(masks, cams)) for masks in (empty, full)]
     assert all(np.isfinite(result.vertices).all() for result in found)
     assert float(jnp.abs(found[0].vertices - found[1].vertices).max()) > 1e-4
 
@@ -184,4 +184,4 @@ def test_masks_of_other_frames_are_told_in_words(model, takes):
     cams = Cameras(take.K, take.T_cam_from_world)
     target = SilhouetteTarget(np.zeros((2, 3, 8, 8), np.float32), cams)
     with pytest.raises(ValueError, match=r"\(frame, view\) = \(2, 3\); got `K` of shape \(3, 3, 3\)"):
-        fit_take_adam(model, take.uv_px, take.K, take.T_cam_from_world, silhouettes=target)
+        fit_take_adam(model, observed(take), silhouettes=target)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.fitting import anatomy, residuals
+from poem_jax.fitting import Observations, anatomy_loss, residuals
 from poem_jax.fitting.kinematics import keypoint_model, pose_keypoints, pose_keypoints_of_rotations
 from poem_jax.hand.joint_limits import POSE_LIMITS
 from poem_jax.hand.mano_file import load
@@ -41,14 +41,14 @@ def test_reprojection(takes, rng):
     weights = np.full(uv.shape[:-1], 0.25)
 
     def residual(joints):
-        return residuals.reprojection(joints, uv, weights, K, T)
+        return residuals.reprojection(joints, Observations(uv, weights, K, T))
 
     assert float(jnp.abs(residual(joints)).max()) < 1e-3
     right = joints + 0.01 * T[0, 0, :3]
     assert float(residual(right)[:, 0, :, 0].min()) > 0, (
         "a joint moved to a camera's right projects further right"
     )
-    assert float(jnp.abs(residuals.reprojection(joints + 1, uv, 0 * weights, K, T)).max()) == 0
+    assert float(jnp.abs(residuals.reprojection(joints + 1, Observations(uv, 0 * weights, K, T))).max()) == 0
     check_gradient(lambda x: jnp.sum(residual(x) ** 2), joints + 0.01 * rng.normal(size=joints.shape), rng)
 
 
@@ -76,7 +76,7 @@ def test_pose_prior(rng):
     middle = POSE_LIMITS.mean(-1)
     np.testing.assert_allclose(residuals.pose_prior(middle, POSE_LIMITS), 0, atol=1e-12)
     assert float(residuals.pose_prior(middle + 0.1, POSE_LIMITS).min()) > 0
-    edge = residuals.pose_prior(POSE_LIMITS[..., 1], POSE_LIMITS, least_sigma=0.0)
+    edge = residuals.pose_prior(POSE_LIMITS[..., 1], POSE_LIMITS, min_sigma=0.0)
     np.testing.assert_allclose(edge, 1)
     check_gradient(lambda x: jnp.sum(residuals.pose_prior(x, POSE_LIMITS) ** 2), middle + 0.2, rng)
 
@@ -110,9 +110,9 @@ def test_geman_mcclure(rng):
 
 
 def anatomy_of(model, quaternions, shape):
-    rotations = anatomy.rotations_from_raw_quaternions(quaternions)
+    rotations = anatomy_loss.rotations_from_raw_quaternions(quaternions)
     posed = pose_keypoints_of_rotations(model, rotations, shape)
-    return anatomy.anatomy_terms(quaternions, shape, posed.rotations, posed.points, model.hand.is_left)
+    return anatomy_loss.anatomy_terms(quaternions, shape, posed.rotations, posed.points, model.hand.is_left)
 
 
 def test_anatomy_vanishes_for_the_flat_hand(model64):
@@ -124,7 +124,7 @@ def test_anatomy_vanishes_for_the_flat_hand(model64):
 def test_anatomy_punishes_what_it_says(model64):
     """Bending a finger joint about l is free of b, u and l; turning it about the bone or backwards is not."""
     rest = pose_keypoints(model64, jnp.zeros((16, 3)), jnp.zeros(10))
-    axes = anatomy.bone_axes(rest.rotations, rest.points)
+    axes = anatomy_loss.bone_axes(rest.rotations, rest.points)
 
     def turned(axis, angle):
         half = angle / 2
@@ -143,9 +143,9 @@ def test_a_left_hands_terms_are_those_of_its_mirror_image(model64, rng):
     quaternions = np.tile([1.0, 0, 0, 0], (16, 1)) + 0.3 * rng.normal(size=(16, 4))
     shape, mirror = rng.normal(size=10), np.diag([-1.0, 1, 1])
     posed = pose_keypoints_of_rotations(
-        model64, anatomy.rotations_from_raw_quaternions(quaternions), jnp.asarray(shape)
+        model64, anatomy_loss.rotations_from_raw_quaternions(quaternions), jnp.asarray(shape)
     )
-    left = anatomy.anatomy_terms(
+    left = anatomy_loss.anatomy_terms(
         quaternions * [1, 1, -1, -1], shape, mirror @ posed.rotations @ mirror, posed.points @ mirror, True
     )
     np.testing.assert_allclose(left, anatomy_of(model64, quaternions, shape), rtol=1e-9)
@@ -154,7 +154,7 @@ def test_a_left_hands_terms_are_those_of_its_mirror_image(model64, rng):
 def test_anatomy_gradients(model64, rng):
     quaternions = np.tile([1.0, 0, 0, 0], (16, 1)) + 0.3 * rng.normal(size=(16, 4))
     shape = jnp.asarray(rng.normal(size=10))
-    for name in anatomy.AnatomyTerms._fields:
+    for name in anatomy_loss.AnatomyTerms._fields:
         check_gradient(lambda q, name=name: getattr(anatomy_of(model64, q, shape), name), quaternions, rng)
 
 

@@ -4,19 +4,22 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.keypoint_agreement import judge_fit
-from poem_jax.fitting.keypoints import KeypointNoise
+from poem_jax.fitting import FitConfig, KeypointNoise, Observations, fit_take, fit_take_adam
+from poem_jax.fitting.adam import AdamRecipe, released_start
 from poem_jax.fitting.kinematics import keypoint_model, pose_keypoints
 from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState
+from poem_jax.fitting.silhouette import SilhouetteTarget
 from poem_jax.fitting.smooth import SmoothConfig, eliminate, smooth, take_cost
-from poem_jax.fitting.solvers import FitConfig, fit_take
 from poem_jax.fitting.start import can_be_placed, closed_form_pose
-from poem_jax.geometry.cameras import project
+from poem_jax.geometry.cameras import Cameras, project, resize_intrinsics
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.geometry.triangulation import triangulate
+from poem_jax.geometry.world_origin import move_origin
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
+from tests.fitting.observed import observed
 
 FRAMES = 24
 AT_REST = SmoothConfig(sigma_angle=0.02, sigma_m=0.005)
@@ -24,9 +27,14 @@ MODES = {mode: FitConfig(lm=LMConfig(shape_mode=mode)) for mode in ShapeMode}
 fit = jax.jit(fit_take, static_argnames="config")
 
 
+def weighted(take, mask=None) -> Observations:
+    """With weights always, so that tests share compiled programs."""
+    weights = np.ones(take.uv_px.shape[:-1], np.float32) if mask is None else mask.astype(np.float32)
+    return observed(take, weights=weights)
+
+
 def shared(model, take, mask=None):
-    mask = np.ones(take.uv_px.shape[:-1], bool) if mask is None else mask
-    return fit(model, take.uv_px, take.K, take.T_cam_from_world, mask=mask, config=MODES[ShapeMode.SHARED])
+    return fit(model, weighted(take, mask), config=MODES[ShapeMode.SHARED])
 
 
 def error_mm(result, take, what="joints"):
@@ -63,7 +71,7 @@ def test_planted_parameters_are_recovered(takes, side):
 @pytest.mark.slow
 def test_200_random_hands_are_recovered(model, takes):
     take = takes(200, 4, 0.0, 12, own_shapes=True)
-    result = fit(model, take.uv_px, take.K, take.T_cam_from_world, config=MODES[ShapeMode.PER_FRAME])
+    result = fit(model, observed(take), config=MODES[ShapeMode.PER_FRAME])
     found = error_mm(result, take).max(axis=-1) < 2
     assert len(found) == 200
     assert found.mean() >= 0.98
@@ -74,25 +82,23 @@ def fits(model, takes, views, noise_px, mode=ShapeMode.SHARED, outlier_share=0.0
     for seed in range(8):
         take = takes(FRAMES, views, noise_px, seed, outlier_share=outlier_share)
         shape = take.shape[0] if mode is ShapeMode.GIVEN else None
-        mask = np.ones(take.uv_px.shape[:-1], bool)
-        args = (model, take.uv_px, take.K, take.T_cam_from_world)
-        yield take, fit(*args, mask=mask, shape=shape, config=MODES[mode])
+        yield take, fit(model, weighted(take), shape=shape, config=MODES[mode])
 
 
 @pytest.mark.parametrize(
-    ("views", "noise_px", "most_mm"),
+    ("views", "noise_px", "max_mm"),
     [
         (4, 2.0, 1.7),
         *(pytest.param(*case, marks=pytest.mark.slow) for case in ((8, 1.0, 0.7), (2, 2.0, 3.5))),
     ],
 )
-def test_accuracy_with_unknown_shape(model, takes, views, noise_px, most_mm):
+def test_accuracy_with_unknown_shape(model, takes, views, noise_px, max_mm):
     errors, inside = [], []
     for take, result in fits(model, takes, views, noise_px):
         assert bool(result.valid.all())
         errors.append(error_mm(result, take).mean())
         inside.append((np.abs(result.joints - take.joints) < result.sigma_m[..., None]).mean())
-    assert np.mean(errors) <= most_mm
+    assert np.mean(errors) <= max_mm
     assert 0.60 <= np.mean(inside) <= 0.76
 
 
@@ -130,9 +136,8 @@ def test_frames_without_key_points_change_nothing(model, takes):
     take, config = takes(FRAMES, 4, 2.0, 13), FitConfig(smooth=AT_REST)
     uv = take.uv_px.copy()
     uv[9:] = np.nan
-    cameras = (take.K, take.T_cam_from_world)
     padded = smoothed(model, take._replace(uv_px=uv))
-    alone = fit(model, uv[:9], *cameras, mask=np.ones((9, 4, 21), bool), config=config)
+    alone = fit(model, weighted(take._replace(uv_px=uv[:9])), config=config)
     assert bool(alone.valid.all())
     for name in ("joints", "vertices", "sigma_m"):
         np.testing.assert_allclose(getattr(padded, name)[:9], getattr(alone, name), atol=2e-5)
@@ -250,9 +255,7 @@ def walking(take, hand, pace, seed=20):
 
 
 def smoothed(model, take, mask=None):
-    mask = np.ones(take.uv_px.shape[:-1], bool) if mask is None else mask
-    config = FitConfig(smooth=AT_REST)
-    return fit(model, take.uv_px, take.K, take.T_cam_from_world, mask=mask, config=config)
+    return fit(model, weighted(take, mask), config=FitConfig(smooth=AT_REST))
 
 
 def test_the_second_pass(model, takes):
@@ -308,7 +311,7 @@ def test_the_second_pass_never_raises_the_cost(model, takes):
     take = takes(4, 4, 1.0, 13)
     frames = (jnp.broadcast_to(x, (4, *x.shape)) for x in (take.K, take.T_cam_from_world))
     weights = jnp.ones(take.uv_px.shape[:-1])
-    seen = TakeObservations(jnp.asarray(take.uv_px), weights, *frames, jnp.ones(4, bool))
+    seen = TakeObservations(Observations(jnp.asarray(take.uv_px), weights, *frames), jnp.ones(4, bool))
     pose, wrist = closed_form_pose(model, take.joints, jnp.ones((4, 21), bool), jnp.zeros((4, 10)))
     begin = TakeState(pose, wrist, jnp.zeros((4, 10)))
 
@@ -335,10 +338,10 @@ def test_hands_of_both_sides_may_be_mapped_over(takes):
     both = [draw_keypoint_take(default_hand(side), 8, 4, 1.0, 13) for side in ("right", "left")]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *models)
     uv = np.stack([take.uv_px for take in both])
-    mapped = jax.jit(jax.vmap(fit_take, (0, 0, None, None)))
-    result = mapped(stacked, uv, both[0].K, both[0].T_cam_from_world)
+    mapped = jax.jit(jax.vmap(fit_take, (0, Observations(0, None, None, None))))
+    result = mapped(stacked, observed(both[0], uv_px=uv))
     for index, (model, take) in enumerate(zip(models, both, strict=True)):
-        alone = fit(model, take.uv_px, take.K, take.T_cam_from_world, config=FitConfig())
+        alone = fit(model, observed(take), config=FitConfig())
         np.testing.assert_allclose(result.joints[index], alone.joints, atol=2e-5)
 
 
@@ -349,8 +352,7 @@ def test_the_size_of_the_images_does_not_matter(model, takes):
     zoom = np.diag([2, 2, 1]).astype(np.float32)
     config = FitConfig(noise=KeypointNoise.of_images(np.array([[2560, 1440]])))
     one = shared(model, take)
-    mask = np.ones(take.uv_px.shape[:-1], bool)
-    two = fit(model, 2 * take.uv_px, zoom @ take.K, take.T_cam_from_world, mask=mask, config=config)
+    two = fit(model, weighted(take)._replace(uv_px=2 * take.uv_px, K=zoom @ take.K), config=config)
     np.testing.assert_array_equal(one.inlier_mask, two.inlier_mask)
     np.testing.assert_allclose(one.joints, two.joints, atol=2e-5)
     np.testing.assert_allclose(2 * one.sigma_px, two.sigma_px, rtol=1e-4)
@@ -359,23 +361,55 @@ def test_the_size_of_the_images_does_not_matter(model, takes):
 
 def test_bad_input_raises(model, takes):
     take = takes(2, 3, 0.0, 17)
-    given = (take.uv_px, take.K, take.T_cam_from_world)
-    with pytest.raises(ValueError, match="at least two views"):
-        fit_take(model, take.uv_px[:, :1], take.K[:1], take.T_cam_from_world[:1])
-    with pytest.raises(ValueError, match="same views"):
-        fit_take(model, take.uv_px, take.K[:2], take.T_cam_from_world[:2])
-    with pytest.raises(ValueError, match=r"T_cam_from_world.*\(3, 4, 4\).*got \(3, 3, 4\)"):
-        fit_take(model, take.uv_px, take.K, take.T_cam_from_world[:, :3])
-    with pytest.raises(ValueError, match="21, 2"):
-        fit_take(model, take.uv_px[0], take.K, take.T_cam_from_world)
-    with pytest.raises(ValueError, match="GIVEN"):
-        fit_take(model, *given, shape=np.zeros(10, np.float32))
-    with pytest.raises(ValueError, match="`confidence` must have shape"):
-        fit_take(model, *given, np.ones((2, 3), np.float32))
-    with pytest.raises(ValueError, match="`mask` must have shape"):
-        fit_take(model, *given, mask=np.ones((2, 21), bool))
-    with pytest.raises(ValueError, match=r"\(10,\) or \(2, 10\); got \(5,\)"):
-        fit_take(model, *given, shape=np.zeros(5), config=MODES[ShapeMode.GIVEN])
+    K, T = take.K, take.T_cam_from_world
+
+    def refused(match, shape=None, mode=ShapeMode.SHARED, **changes):
+        with pytest.raises(ValueError, match=match):
+            fit_take(model, observed(take, **changes), shape, MODES[mode])
+
+    refused("at least two views", uv_px=take.uv_px[:, :1], K=K[:1], T_cam_from_world=T[:1])
+    refused("same views", K=K[:2], T_cam_from_world=T[:2])
+    refused(r"T_cam_from_world.*\(3, 4, 4\).*got \(3, 3, 4\)", T_cam_from_world=T[:, :3])
+    refused("21, 2", uv_px=take.uv_px[0])
+    refused("GIVEN", shape=np.zeros(10, np.float32))
+    refused("`weights` must have shape", weights=np.ones((2, 3), np.float32))
+    refused(r"\(10,\) or \(2, 10\); got \(5,\)", shape=np.zeros(5), mode=ShapeMode.GIVEN)
+
+
+@pytest.mark.parametrize("origin", [[50e3, 20e3, 100.0], [500e3, 4500e3, 300.0]])
+def test_a_world_far_from_its_origin_gives_the_same_hand(model, takes, origin):
+    """A hall survey, and projected map coordinates; what is added back is added in float64."""
+    take, origin = takes(FRAMES, 4, 1.0, 13), np.asarray(origin)
+    T = take.T_cam_from_world.astype(np.float64)
+    far = move_origin(T, -origin)
+    near, result = (fit_take(model, weighted(take)._replace(T_cam_from_world=t)) for t in (T, far))
+    assert bool(result.valid.all())
+    for name in ("joints", "vertices", "translation"):
+        assert getattr(result, name).dtype == np.float64
+        np.testing.assert_allclose(getattr(result, name) - origin, getattr(near, name), atol=3e-5)
+    np.testing.assert_allclose(result.reprojection_px, near.reprojection_px, atol=0.05)
+    with pytest.raises(ValueError, match=r"origin.*must be float64"):
+        fit_take(model, weighted(take)._replace(T_cam_from_world=far.astype(np.float32)))
+
+
+@pytest.mark.parametrize("origin", [[50e3, 20e3, 100.0]])
+def test_a_far_world_moves_start_and_silhouettes_of_the_iterative_fit(model, takes, origin):
+    take, origin = takes(1, 2, 0.0, 13), np.asarray(origin)
+    T = take.T_cam_from_world.astype(np.float64)
+    far = move_origin(T, -origin)
+    K = resize_intrinsics(take.K, (720, 1280), (24, 24))
+    begin = released_start(None, np.array([0.1, 0, 0], np.float32))
+    begin = jax.tree.map(lambda x: np.asarray(x, np.float64)[None], begin)
+
+    def run(T, start):
+        target = SilhouetteTarget(np.ones((1, 2, 24, 24), np.float32), Cameras(K[None], T[None]))
+        recipe = AdamRecipe(steps=3)
+        return fit_take_adam(
+            model, observed(take, T_cam_from_world=T), start, recipe, silhouettes=target
+        ).joints
+
+    moved = run(far, begin._replace(translation=begin.translation + origin)) - origin
+    np.testing.assert_allclose(moved, run(T, begin), atol=3e-5)
 
 
 @pytest.mark.parity
@@ -385,8 +419,9 @@ def test_released_key_points(shared_dir):
     golden = np.load(folder / "golden_fit.npz")
     keypoints = golden["keypoints"][None]
     cameras = (golden["cam_intr"], golden["cam_extr_master_to_cam"])
+    seen = Observations(keypoints[..., :2], keypoints[..., 2], *cameras)
     hand = keypoint_model(load(folder / "fake_mano.npz"))
-    result = fit(hand, keypoints[..., :2], *cameras, keypoints[..., 2], config=FitConfig())
+    result = fit(hand, seen, config=FitConfig())
     points, _ = triangulate(keypoints[0, ..., :2], *cameras, weights=np.sqrt(keypoints[0, ..., 2]))
     fitted, dlt = (
         1000 * np.linalg.norm(joints - golden["gt_joints"], axis=-1).mean()

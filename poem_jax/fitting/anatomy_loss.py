@@ -15,7 +15,7 @@ from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle, trans
 from poem_jax.hand.topology import NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE
 from poem_jax.typing import Array, Bool, Float
 
-LEAST_ANGLE = 0.01
+MIN_ANGLE = 0.01
 """Radians."""
 TERM_WEIGHTS = (1.0, 0.1, 0.1, 1.0, 0.1, 0.1)
 """The release's weights, in the order of `AnatomyTerms`."""
@@ -158,7 +158,7 @@ def axis_and_angle(
 
 def _grouped(restricted: Array, knuckle: Array, thumb: Array, angle: Array) -> Array:
     """Sum the mean squares of the three groups; joints hardly turned count as zero."""
-    turned = angle >= LEAST_ANGLE
+    turned = angle >= MIN_ANGLE
     groups = ((restricted, _RESTRICTED), (knuckle, _KNUCKLES), (thumb, _THUMB))
     return sum(jnp.mean((value**2 * turned)[..., group], axis=-1) for value, group in groups)
 

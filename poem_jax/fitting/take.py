@@ -2,29 +2,25 @@
 
 `fit_take` triangulates robustly, poses the hand in closed form, and refines pose, place and shape by
 Levenberg-Marquardt (`lm`). `fit_take_adam` runs the paper's iterative optimisation on the same input. Both
-are pure, work under `jax.jit` (config static) and `jax.vmap` (over hands or takes; models of several hands
-are stacked leaf by leaf), and never let one bad frame stop a take.
+compile themselves, once per configuration and size, and work within `jax.jit` (config static) and `jax.vmap`
+(over hands or takes; models of several hands are stacked leaf by leaf). No bad frame stops a take.
+
+Worlds may be far from their origin: concrete extrinsics in float64 are moved near it before they are rounded,
+and results come back in float64. Under a trace this is not possible, and not done.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
 from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
-from poem_jax.fitting.anatomy import rotations_from_raw_quaternions
-from poem_jax.fitting.keypoints import (
-    REFERENCE_DIAGONAL_PX,
-    KeypointNoise,
-    RobustPoints,
-    finite_cameras,
-    projection_jacobian,
-    relative_confidence,
-    triangulate_robust,
-    usable_keypoints,
-)
-from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
+from poem_jax.fitting.anatomy_loss import rotations_from_raw_quaternions
+from poem_jax.fitting.kinematics import KeypointModel, rest_wrist
 from poem_jax.fitting.lm import (
     LMConfig,
     ShapeMode,
@@ -34,15 +30,22 @@ from poem_jax.fitting.lm import (
     joint_sigma,
     solve,
 )
+from poem_jax.fitting.observations import Observations, clean
+from poem_jax.fitting.robust_triangulation import (
+    REFERENCE_DIAGONAL_PX,
+    KeypointNoise,
+    RobustPoints,
+    triangulate_robust,
+)
 from poem_jax.fitting.silhouette import SilhouetteTarget
 from poem_jax.fitting.smooth import SmoothConfig, smooth, smoothed_sigma
 from poem_jax.fitting.start import can_be_placed, closed_form_pose
+from poem_jax.geometry.cameras import projection_jacobian
 from poem_jax.geometry.transforms import axis_angle_from_rotation
-from poem_jax.hand.model import HandModel, hand_mesh
+from poem_jax.geometry.world_origin import distant_origin, move_origin
+from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, WRIST
 from poem_jax.typing import Array, Bool, Float
-
-__all__ = ["FitConfig", "FitResult", "HandModel", "fit_take", "fit_take_adam", "keypoint_model"]
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,10 @@ class FitConfig:
 
 
 class FitResult(NamedTuple):
-    """A hand over a take. World frame, metres; where not `valid`, finite numbers that mean nothing."""
+    """A hand over a take. World frame, metres; where not `valid`, finite numbers that mean nothing.
+
+    Of a far world, `translation`, `joints` and `vertices` are NumPy arrays in float64.
+    """
 
     pose: Float[Array, "frame 16 3"]
     """Axis-angle, MANO order; row 0 turns the hand about its wrist joint into the world."""
@@ -74,8 +80,8 @@ class FitResult(NamedTuple):
     valid: Bool[Array, "frame"]
     """True where at least two views gave three or more joints that do not lie on one line."""
     reprojection_px: Float[Array, "frame view"]
-    """Mean distance of the fitted joints from the finite, unmasked key points, outliers included; NaN where
-    a view has none."""
+    """Mean distance of the fitted joints from the key points seen, outliers included; NaN where a view has
+    none."""
     sigma_m: Float[Array, "frame 21"]
     """Standard deviation of one coordinate of each joint; zero where not `valid`."""
     inlier_mask: Bool[Array, "frame view 21"]
@@ -89,11 +95,7 @@ class FitResult(NamedTuple):
 
 def fit_take(
     model: KeypointModel,
-    keypoints_px: Float[Array, "..."],
-    K: Float[Array, "..."],
-    T_cam_from_world: Float[Array, "..."],
-    confidence: Float[Array, "..."] | None = None,
-    mask: Bool[Array, "..."] | None = None,
+    observations: Observations,
     shape: Float[Array, "..."] | None = None,
     config: FitConfig = FitConfig(),
 ) -> FitResult:
@@ -103,38 +105,38 @@ def fit_take(
 
     Args:
         model: `keypoint_model(hand)` of the hand's own side.
-        keypoints_px: (frame, view, 21, 2) OpenPose order; NaN = unseen.
-        K: (view, 3, 3) or (frame, view, 3, 3) of these (undistorted) pixels.
-        T_cam_from_world: (view, 4, 4) or (frame, view, 4, 4), metres.
-        confidence: (frame, view, 21) inverse variance, on any scale; NaN or zero = unseen; None means equal.
-        mask: (frame, view, 21); False means "ignore".
+        observations: `uv_px` (frame, view, 21, 2); `weights` (frame, view, 21) or None; `K` and
+            `T_cam_from_world` (view, ...) or (frame, view, ...).
         shape: the known shape (10,) or (frame, 10); needed by, and only used in, `ShapeMode.GIVEN`.
         config: static under `jax.jit`; its `noise` is that of 1280 x 720 images unless given:
             `FitConfig(noise=KeypointNoise.of_images(size_wh))`.
 
     Raises:
-        ValueError: fewer than two views; key points, cameras and shape that do not belong together.
+        ValueError: fewer than two views; key points, cameras and shape that do not belong together; a far
+            world whose extrinsics are not float64.
     """
-    given = config.lm.shape_mode is ShapeMode.GIVEN
-    _check(keypoints_px, K, T_cam_from_world, confidence, mask, shape, given)
-    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config.noise)
-    start = _start(model, points, take, shape)
-    state = solve(model, take, start, config.lm)
+    _check(observations, shape, config.lm.shape_mode is ShapeMode.GIVEN)
+    near, origin = _near_world(model, observations)
+    return _move_back(_fit_take(model, near, shape, config), origin)
+
+
+@partial(jax.jit, static_argnames="config")
+def _fit_take(
+    model: KeypointModel, observations: Observations, shape: Array | None, config: FitConfig
+) -> FitResult:
+    take, points = _observe(observations, config.noise)
+    state = solve(model, take, _start(model, points, take, shape), config.lm)
     if config.smooth is None:
         sigma = joint_sigma(model, take, state, config.lm)
     else:
         state, motion = smooth(model, take, state, config.lm, config.smooth)
         sigma = smoothed_sigma(model, take, state, config.lm, motion)
-    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px, config.lm)
+    return _result(model, observations, take, state, sigma, points.sigma_px, config.lm)
 
 
 def fit_take_adam(
     model: KeypointModel,
-    keypoints_px: Float[Array, "frame view 21 2"],
-    K: Float[Array, "*#frame view 3 3"],
-    T_cam_from_world: Float[Array, "*#frame view 4 4"],
-    confidence: Float[Array, "frame view 21"] | None = None,
-    mask: Bool[Array, "frame view 21"] | None = None,
+    observations: Observations,
     start: AdamParameters | None = None,
     recipe: AdamRecipe = ADAM_300,
     *,
@@ -155,50 +157,79 @@ def fit_take_adam(
 
     Returns: as `fit_take`, with `sigma_m` zero: this solver has no uncertainty.
     """
-    _check(keypoints_px, K, T_cam_from_world, confidence, mask, None, given=False)
-    _check_silhouettes(silhouettes, keypoints_px.shape[:2])
-    take, points = _observe(keypoints_px, K, T_cam_from_world, confidence, mask, config.noise)
-    usable = take.weights > 0
-    weights = usable.astype(take.weights.dtype) if confidence is None else jnp.where(usable, confidence, 0)
+    _check(observations, None, given=False)
+    _check_silhouettes(silhouettes, observations.uv_px.shape[:2])
+    near, origin = _near_world(model, observations)
+    if origin.any():
+        start = None if start is None else start._replace(translation=start.translation - origin)
+        if silhouettes is not None:
+            T = move_origin(silhouettes.cams.T_cam_from_world, origin)
+            silhouettes = silhouettes._replace(cams=silhouettes.cams._replace(T_cam_from_world=T))
+    result = _fit_take_adam(model, near, start, recipe, config, diagonal_px, silhouettes)
+    return _move_back(result, origin)
+
+
+@partial(jax.jit, static_argnames=("recipe", "config"))
+def _fit_take_adam(
+    model: KeypointModel,
+    observations: Observations,
+    start: AdamParameters | None,
+    recipe: AdamRecipe,
+    config: FitConfig,
+    diagonal_px: float | Array,
+    silhouettes: SilhouetteTarget | None,
+) -> FitResult:
+    take, points = _observe(observations, config.noise)
+    inliers = take.seen.weights > 0
+    given = 1.0 if observations.weights is None else jnp.asarray(observations.weights)
+    seen = take.seen._replace(weights=jnp.where(inliers, given, 0).astype(take.seen.weights.dtype))
     if start is None:
         start = jax.vmap(lambda wrist: released_start(None, wrist))(points.points[:, WRIST])
 
     def one(frame: tuple) -> AdamParameters:
-        uv, w, K, T, begin, masks = frame
-        found, _ = adam_fit(model, uv, w, K, T, begin, recipe, diagonal_px=diagonal_px, silhouettes=masks)
-        return found
+        own, begin, masks = frame
+        return adam_fit(model, own, begin, recipe, diagonal_px=diagonal_px, silhouettes=masks)[0]
 
-    frames = (take.uv_px, weights, take.K, take.T_cam_from_world, start, silhouettes)
+    frames = (seen, start, silhouettes)
     found = jax.vmap(one)(frames) if silhouettes is None else jax.lax.map(one, frames)
     pose = axis_angle_from_rotation(rotations_from_raw_quaternions(found.quaternions))
     state = TakeState(pose, found.translation, found.shape)
     sigma = jnp.zeros((*pose.shape[:1], NUM_JOINTS))
-    return _result(model, keypoints_px, confidence, mask, take, state, sigma, points.sigma_px, config.lm)
+    return _result(model, observations, take, state, sigma, points.sigma_px, config.lm)
 
 
-def _check(
-    uv: Array,
-    K: Array,
-    T: Array,
-    confidence: Array | None,
-    mask: Array | None,
-    shape: Array | None,
-    given: bool,
-) -> None:
+def _near_world(
+    model: KeypointModel, observations: Observations
+) -> tuple[Observations, Float[np.ndarray, "3"]]:
+    """Move a far world near its cameras; return where its new origin lies in the old world."""
+    T = observations.T_cam_from_world
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, observations)))
+    origin = np.zeros(3) if traced else distant_origin(T)
+    return observations._replace(T_cam_from_world=move_origin(T, origin) if origin.any() else T), origin
+
+
+def _move_back(result: FitResult, origin: Float[np.ndarray, "3"]) -> FitResult:
+    if not origin.any():
+        return result
+    moved = {name: getattr(result, name) for name in ("translation", "joints", "vertices")}
+    return result._replace(**{name: np.asarray(x, np.float64) + origin for name, x in moved.items()})
+
+
+def _check(observations: Observations, shape: Array | None, given: bool) -> None:
+    uv, weights, K, T = observations
     if uv.ndim != 4 or uv.shape[-2:] != (NUM_JOINTS, 2):
-        raise ValueError(f"`keypoints_px` must have shape (frame, view, 21, 2); got {uv.shape}")
+        raise ValueError(f"`uv_px` must have shape (frame, view, 21, 2); got {uv.shape}")
     frames, views = uv.shape[:2]
     if views < 2:
-        raise ValueError(f"a fit needs at least two views; got `keypoints_px` of shape {uv.shape}")
+        raise ValueError(f"a fit needs at least two views; got `uv_px` of shape {uv.shape}")
     for name, cameras, size in (("K", K, 3), ("T_cam_from_world", T, 4)):
         if cameras.shape not in ((views, size, size), (frames, views, size, size)):
             raise ValueError(
                 f"key points and cameras must have the same views: `{name}` must have shape "
                 f"({views}, {size}, {size}), or ({frames}, {views}, {size}, {size}); got {cameras.shape}"
             )
-    for name, array in (("confidence", confidence), ("mask", mask)):
-        if array is not None and array.shape != uv.shape[:-1]:
-            raise ValueError(f"`{name}` must have shape {uv.shape[:-1]}; got {array.shape}")
+    if weights is not None and weights.shape != uv.shape[:-1]:
+        raise ValueError(f"`weights` must have shape {uv.shape[:-1]}; got {weights.shape}")
     if given != (shape is not None):
         raise ValueError(f"`shape` goes with ShapeMode.GIVEN, and only with it; got shape {shape}")
     if shape is not None and shape.shape not in ((NUM_SHAPES,), (frames, NUM_SHAPES)):
@@ -223,20 +254,15 @@ def _check_silhouettes(silhouettes: SilhouetteTarget | None, frames_and_views: t
             )
 
 
-def _observe(
-    uv: Array, K: Array, T: Array, confidence: Array | None, mask: Array | None, noise: KeypointNoise
-) -> tuple[TakeObservations, RobustPoints]:
+def _observe(observations: Observations, noise: KeypointNoise) -> tuple[TakeObservations, RobustPoints]:
     """Triangulate, and keep the key points that agree with it as observations."""
-    uv = jnp.asarray(uv)
-    K, T, known = finite_cameras(K, T, uv.shape[:1])
-    seen = usable_keypoints(uv, known, confidence, mask)
-    points = triangulate_robust(uv, K, T, confidence, seen, noise=noise, take_axis=0)
-    trusted = jnp.ones(seen.shape, uv.dtype) if confidence is None else jnp.asarray(confidence, uv.dtype)
-    relative = relative_confidence(trusted, seen, 0)
-    weights = jnp.where(points.inlier_mask, relative / points.sigma_px[:, None, None] ** 2, 0)
-    clean = jnp.where(points.inlier_mask[..., None], uv, 0)
-    placed = can_be_placed(points.points, points.valid, points.covariance)
-    return TakeObservations(clean, weights, K, T, placed), points
+    points = triangulate_robust(observations, noise=noise, frame_axis=0)
+    seen = clean(observations, 0)
+    kept, variance = points.inlier_mask, points.sigma_px[:, None, None] ** 2
+    seen = seen._replace(
+        uv_px=jnp.where(kept[..., None], seen.uv_px, 0), weights=jnp.where(kept, seen.weights / variance, 0)
+    )
+    return TakeObservations(seen, can_be_placed(points.points, points.valid, points.covariance)), points
 
 
 def _start(
@@ -253,9 +279,7 @@ def _start(
 
 def _result(
     model: KeypointModel,
-    keypoints_px: Array,
-    confidence: Array | None,
-    mask: Array | None,
+    observations: Observations,
     take: TakeObservations,
     state: TakeState,
     sigma: Array,
@@ -264,11 +288,10 @@ def _result(
 ) -> FitResult:
     translation = state.wrist - rest_wrist(model, state.shape)
     mesh = hand_mesh(model.hand, state.pose, state.shape, translation)
-    pixels, _ = projection_jacobian(take.K, take.T_cam_from_world, mesh.joints)
-    counted = jnp.all(jnp.isfinite(keypoints_px), axis=-1)
-    counted = counted if mask is None else counted & mask
-    counted = counted if confidence is None else counted & (confidence > 0)
-    distance = jnp.linalg.norm(pixels - jnp.where(counted[..., None], keypoints_px, pixels + 1), axis=-1)
+    every = clean(observations, 0)
+    pixels, _ = projection_jacobian(every.K, every.T_cam_from_world, mesh.joints)
+    counted = every.weights > 0
+    distance = jnp.linalg.norm(pixels - jnp.where(counted[..., None], every.uv_px, pixels + 1), axis=-1)
     count = jnp.sum(counted, axis=-1)
     mean = jnp.sum(jnp.where(counted, distance, 0), axis=-1) / jnp.maximum(count, 1)
     finite = jnp.all(jnp.isfinite(mesh.joints), axis=(-2, -1)) & jnp.all(jnp.isfinite(sigma), axis=-1)
@@ -282,7 +305,7 @@ def _result(
         valid,
         jnp.where((count > 0) & valid[:, None], mean, jnp.nan),
         jnp.where(valid[:, None], sigma, 0),
-        take.weights > 0,
+        take.seen.weights > 0,
         sigma_px,
         jnp.where(valid, frame_cost(model, take, state, config.robust_sigmas, config), jnp.nan),
     )
