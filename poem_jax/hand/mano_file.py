@@ -4,8 +4,13 @@ The pickles were written by Python 2 and hold chumpy variables and a scipy spars
 needed, nor is the pickle trusted: `io/safe_pickle.py` keeps their state in inert stand-ins, and the arrays
 are taken out here. MANO's mean pose is not used in the hand: as in the released models, zero pose means the
 flat hand; `load_pose_space` reads it for conversions.
+
+The `MANO_LEFT.pkl` that was published has a known fault: the x components of its `shapedirs` were not
+mirrored with the hand, so that shape coefficients which should lengthen the fingers shorten them. It is
+recognised by the shape directions themselves and mended, with a warning.
 """
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from poem_jax.hand.conventions import FINGER_NUMBERS, PoseSpace
-from poem_jax.hand.mano_values import as_array
+from poem_jax.hand.mano_pickle import as_array
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import (
     MANO_PARENTS,
@@ -23,7 +28,9 @@ from poem_jax.hand.topology import (
     NUM_SKELETON_JOINTS,
     NUM_VERTICES,
 )
+from poem_jax.io.npz_file import read_npz
 from poem_jax.io.safe_pickle import StandIn, load_arrays_pickle
+from poem_jax.io.sparse_matrices import is_sparse_matrix
 
 _SHAPES = {
     "v_template": (NUM_VERTICES, 3),
@@ -37,8 +44,15 @@ _POSE_SPACE_SHAPES = {
     "hands_mean": (FINGER_NUMBERS,),
     "hands_components": (FINGER_NUMBERS, FINGER_NUMBERS),
 }
+_KNUCKLES = (1, 4, 7, 10)
+"""First joints of index, middle, little and ring finger in MANO's order."""
 _SUM_TOLERANCE = 1e-3
 _LONGEST_HAND_M = 1.0
+_CLEAR_AGREEMENT = 0.3
+"""Beyond this, `_agreement_of_length_and_width` tells: +0.80 for our own hand, -0.80 with the fault, and
+0 +- 0.3 for shape directions of random numbers."""
+
+_log = logging.getLogger(__name__)
 
 
 def load(path: str | Path, side: str | None = None) -> HandModel:
@@ -46,7 +60,8 @@ def load(path: str | Path, side: str | None = None) -> HandModel:
 
     Args:
         path: the file; neither chumpy nor scipy is needed, and nothing in the file is run.
-        side: "right" or "left"; None takes it from the file's name: left if that says so, else right.
+        side: "right" or "left"; None takes it from the file's name or, where that says neither or both, from
+            the hand: in MANO's frame the fingers of a right hand point along -x.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -77,25 +92,10 @@ def _read(path: Path) -> dict[str, Any]:
             "or an .npz with MANO's field names"
         )
     if path.suffix == ".npz":
-        return _read_npz(path)
+        return read_npz(path)
     if path.suffix == ".pkl":
         return _read_pickle(path)
     raise ValueError(f"{path} must end in .pkl or .npz; got {path.suffix or 'no suffix'!r}")
-
-
-def _read_npz(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as stream:
-            stored = np.load(stream, allow_pickle=False)
-            if isinstance(stored, np.ndarray):
-                raise ValueError("it holds a single array (.npy); save all of MANO's fields with numpy.savez")
-            return {name: stored[name] for name in stored.files}
-    # Damaged archives raise what zipfile, zlib, struct and NumPy's header parser happen to raise.
-    except Exception as error:
-        raise ValueError(
-            f"{path} must be an .npz of arrays; reading it stopped with {type(error).__name__}: {error}. "
-            "Is the file cut short or of another kind?"
-        ) from error
 
 
 def _read_pickle(path: Path) -> dict[str, Any]:
@@ -108,9 +108,7 @@ def _read_pickle(path: Path) -> dict[str, Any]:
 def _holds_arrays(module: str, name: str) -> bool:
     """Classes of the genuine files that are replaced by stand-ins."""
     package = module.partition(".")[0]
-    return (package == "chumpy" and name[:1].isupper()) or (
-        module.startswith("scipy.sparse") and name in ("csc_matrix", "csr_matrix", "csc_array", "csr_array")
-    )
+    return (package == "chumpy" and name[:1].isupper()) or is_sparse_matrix(module, name)
 
 
 def _hand_model(fields: Mapping[str, Any], source: str, side: str | None) -> HandModel:
@@ -122,16 +120,66 @@ def _hand_model(fields: Mapping[str, Any], source: str, side: str | None) -> Han
         )
     arrays = {name: _checked(name, fields[name], source) for name in _SHAPES}
     _check_values(arrays, fields.get("kintree_table"), source)
-    left = "left" in Path(source).name.lower() if side is None else side == "left"
+    left = (side or _side(arrays, source)) == "left"
     return HandModel(
         v_template=arrays["v_template"],
-        shapedirs=arrays["shapedirs"],
+        shapedirs=_mirrored_with_hand(arrays, source) if left else arrays["shapedirs"],
         posedirs=arrays["posedirs"],
         J_regressor=arrays["J_regressor"],
         weights=arrays["weights"],
         faces=arrays["f"],
         is_left=np.array(left),
     )
+
+
+def _side(arrays: Mapping[str, np.ndarray], source: str) -> str:
+    """Tell the side by the file's name; where that does not, by the direction of the fingers."""
+    skeleton = arrays["J_regressor"] @ arrays["v_template"]
+    fingers = skeleton[list(_KNUCKLES)].mean(axis=0) - skeleton[0]
+    shown = "right" if fingers[0] < 0 else "left"
+    named = [side for side in ("left", "right") if side in Path(source).name.lower()]
+    if named and shown not in named:
+        _log.warning(
+            "%s is read as a %s hand after its name, but its fingers point along %sx as a %s hand's; "
+            "if that is wrong, rename the file",
+            *(source, named[0], "-+"[shown == "left"], shown),
+        )
+    return named[0] if len(named) == 1 else shown
+
+
+def _mirrored_with_hand(arrays: Mapping[str, np.ndarray], source: str) -> np.ndarray:
+    """Return the shape directions of a left hand, x turned round where it was not mirrored with the hand."""
+    shapedirs = arrays["shapedirs"]
+    agreement = _agreement_of_length_and_width(arrays["v_template"], shapedirs)
+    if agreement < -_CLEAR_AGREEMENT:
+        _log.warning(
+            "the x components of `shapedirs` in %s are not mirrored with the hand, a known fault of the "
+            "published MANO_LEFT.pkl: they are turned round; shape coefficients that were found with the "
+            "faulty file belong to other hands here",
+            source,
+        )
+        return shapedirs * np.array([-1, 1, 1], np.float32)[:, None]
+    if agreement < _CLEAR_AGREEMENT:
+        _log.warning(
+            "the x components of `shapedirs` in %s stay as they are: whether they are mirrored with the "
+            "hand, unlike those of the published MANO_LEFT.pkl, cannot be told",
+            source,
+        )
+    return shapedirs
+
+
+def _agreement_of_length_and_width(v_template: np.ndarray, shapedirs: np.ndarray) -> float:
+    """Return how far the hand grows along x (fingers) where it grows along z (palm), from -1 to 1.
+
+    Sizes of hands vary more than their proportions, so of the shape directions, scaled by how much they vary
+    among people, length and width mostly grow together. Growth is the slope of displacement over position;
+    the result is the correlation (about zero) of the two slopes over the ten directions.
+    """
+    place = (v_template - v_template.mean(axis=0)).astype(np.float64)
+    growth = np.einsum("vc,vck->ck", place, shapedirs) / np.square(place).sum(axis=0)[:, None]
+    length, width = growth[0], growth[2]
+    size = np.linalg.norm(length) * np.linalg.norm(width)
+    return float(length @ width / size) if size > 0 else 0.0
 
 
 def _checked(name: str, value: Any, source: str) -> np.ndarray:

@@ -79,8 +79,7 @@ def _problems_named(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        cause = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path} must be an {what}; it cannot be read: {cause}") from error
+        raise ValueError(f"{path} must be an {what}; it cannot be read: {_cause(error)}") from error
 
 
 def _read_members(archive: zipfile.ZipFile, file_size: int) -> dict[str, Array]:
@@ -111,8 +110,7 @@ def _array_named(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        cause = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
-        raise ValueError(f"`{name[:60]}`: {cause}") from error
+        raise ValueError(f"`{name[:60]}`: {_cause(error)}") from error
 
 
 def _read_array(stream: BufferedIOBase, size: int) -> Array:
@@ -135,6 +133,12 @@ def _read_array(stream: BufferedIOBase, size: int) -> Array:
         raise ValueError("its text has characters that do not exist")
     native = flat.astype(dtype.newbyteorder("="), copy=True)
     return native.reshape(shape, order="F" if fortran_order else "C")
+
+
+def _cause(error: Exception) -> str:
+    if type(error) is ValueError:
+        return str(error)
+    return f"{type(error).__name__}: {error}. Is the file cut short, damaged or of another kind?"
 
 
 def _kind(dtype: np.dtype) -> str:

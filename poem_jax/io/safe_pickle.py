@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from poem_jax.io.stored_array import StoredArray, StoredDtype, refuse_change
+from poem_jax.io.pickled_arrays import ObjectDtype, PickledArray, PickledDtype, describe_dtype, refuse_change
 
 _NUMPY_CORE = ("numpy.core", "numpy._core")
 _BUILTINS = ("builtins", "__builtin__")
@@ -120,7 +120,7 @@ def describe_pickle(stream: io.BytesIO, vocabulary: Vocabulary, source: str) -> 
         source: names the pickle in messages.
 
     Returns:
-        Containers of plain values, of `StoredArray`s and of what the vocabulary makes; they may hold
+        Containers of plain values, of `PickledArray`s and of what the vocabulary makes; they may hold
         themselves.
 
     Raises:
@@ -252,11 +252,16 @@ class _Finisher:
         return finished
 
     def _finished(self, value: Any, depth: int) -> Any:
-        if isinstance(value, StoredArray):
-            return value.array()
+        if isinstance(value, PickledArray):
+            made = value.array()
+            return self.finish(made, depth) if isinstance(made, list) else made
         if isinstance(value, tuple):
             return tuple([self.finish(part, depth) for part in value])
         if isinstance(value, StandIn):
+            # Some keep the type of their numbers beside these, which tells it themselves.
+            value.state = {
+                key: v for key, v in value.state.items() if not isinstance(v, PickledDtype | ObjectDtype)
+            }
             self.finish(value.state, depth)
         elif isinstance(value, dict):
             for key in value:
@@ -298,7 +303,7 @@ _NDARRAY = Inert("numpy.ndarray")
 _OBJECT = Inert("object")
 
 
-def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> StoredArray:
+def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> PickledArray:
     """Announce an array that the pickle then fills; only true `ndarray`s."""
     if subtype is not _NDARRAY:
         raise ValueError("only plain numpy.ndarray can be rebuilt")
@@ -306,19 +311,19 @@ def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> StoredArray:
         raise ValueError(
             "an array must start empty and of bytes, as NumPy writes it: no arrays of Python objects"
         )
-    return StoredArray()
+    return PickledArray()
 
 
-def _scalar(dtype: Any, data: Any = None) -> StoredArray:
+def _scalar(dtype: Any, data: Any = None) -> PickledArray:
     """Describe a NumPy scalar by its bytes."""
-    return StoredArray().fill((), dtype, "C", data, scalar=True)
+    return PickledArray().fill((), dtype, "C", data, scalar=True)
 
 
-def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> StoredArray:
+def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> PickledArray:
     """Describe an array by a buffer (pickle protocol 5)."""
     if order not in ("C", "F"):
         raise ValueError("an array's order must be C or F")
-    return StoredArray().fill(shape, dtype, order, data)
+    return PickledArray().fill(shape, dtype, order, data)
 
 
 def _encode(text: Any, encoding: Any = "latin1") -> bytes:
@@ -338,6 +343,28 @@ def _set(members: Any = ()) -> set:
     return set(members)
 
 
+class _OrderedDict(dict):
+    """An OrderedDict or Counter; the attributes that a pickle sets on it (`_metadata`) are dropped."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        if not isinstance(state, dict):
+            raise ValueError(f"the attributes of a dict must come in a dict; got a {type(state).__name__}")
+
+
+def _make_dict(items: Any = ()) -> _OrderedDict:
+    """Build from nothing, from another dict, or from a list of pairs, as Python 2 wrote it."""
+    pairs = list(items.items()) if isinstance(items, dict) else items
+    whole = isinstance(pairs, list | tuple) and all(
+        isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs
+    )
+    if not whole:
+        raise ValueError("a dict must be given as pairs of key and value")
+    check_keys([key for key, _ in pairs])
+    return _OrderedDict(pairs)
+
+
 def _new_stand_in(kind: Any, base: Any, state: Any) -> StandIn:
     """What protocols 0 and 1 call to make an object: here only a stand-in."""
     if not (isinstance(kind, type) and issubclass(kind, StandIn) and base is _OBJECT and state is None):
@@ -351,8 +378,10 @@ def _text(key: Any) -> str:
 
 _ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NDARRAY,
-    ("numpy", "dtype"): Inert("numpy.dtype", StoredDtype),
+    ("numpy", "dtype"): Inert("numpy.dtype", describe_dtype),
     ("_codecs", "encode"): Inert("_codecs.encode", _encode),
+    ("collections", "OrderedDict"): Inert("collections.OrderedDict", _make_dict),
+    ("collections", "Counter"): Inert("collections.Counter", _make_dict),
     **{(f"{core}.multiarray", "_reconstruct"): Inert("_reconstruct", _reconstruct) for core in _NUMPY_CORE},
     **{(f"{core}.multiarray", "scalar"): Inert("scalar", _scalar) for core in _NUMPY_CORE},
     **{(f"{core}.numeric", "_frombuffer"): Inert("_frombuffer", _from_buffer) for core in _NUMPY_CORE},

@@ -4,7 +4,7 @@
 `<root>/data.pkl`, a pickle in which storages of numbers are named by a key, and `<root>/data/<key>`, their
 bytes. Before it was a row of pickles (a magic number, the protocol, facts of the machine, the object, the
 storages' keys), then for each key a count of numbers and the numbers. The pickles go through `safe_pickle`,
-which allows the names of `torch_names` besides its own.
+which allows the names of `torch_pickle` besides its own.
 """
 
 import contextlib
@@ -20,8 +20,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from poem_jax.io.atomic import whole_file
-from poem_jax.io.stored_array import StoredArray, StoredTensor, TensorStorage
-from poem_jax.io.torch_names import DTYPES, describe, make_storage
+from poem_jax.io.pickled_arrays import PickledArray, PickledTensor, TensorStorage
+from poem_jax.io.torch_pickle import DTYPES, describe, make_storage
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001
@@ -244,7 +244,7 @@ def _decode(raw: bytes, dtype: np.dtype, order: str) -> np.ndarray:
     return bits.astype(f"=u{dtype.itemsize}", copy=False).view(dtype)
 
 
-def _find_state_dict(described: Any, source: str) -> dict[str, StoredArray | StoredTensor]:
+def _find_state_dict(described: Any, source: str) -> dict[str, PickledArray | PickledTensor]:
     """Choose the state dict: a usual name, else the dict with most arrays; see `load_state_dict`."""
     if not isinstance(described, dict):
         raise ValueError(f"{source} must hold a dict; got a {type(described).__name__}")
@@ -271,11 +271,11 @@ def _is_of_arrays(value: Any) -> bool:
     return isinstance(value, dict) and 2 * len(_arrays_in(value)) > len(value)
 
 
-def _arrays_in(values: dict) -> dict[str, StoredArray | StoredTensor]:
+def _arrays_in(values: dict) -> dict[str, PickledArray | PickledTensor]:
     return {
         key: value
         for key, value in values.items()
-        if isinstance(key, str) and isinstance(value, StoredArray | StoredTensor)
+        if isinstance(key, str) and isinstance(value, PickledArray | PickledTensor)
     }
 
 
@@ -285,15 +285,15 @@ def _listed(keys: list) -> str:
 
 
 def _read_arrays(
-    stored: dict[str, StoredArray | StoredTensor], file: _ZipForm | _LegacyForm
+    stored: dict[str, PickledArray | PickledTensor], file: _ZipForm | _LegacyForm
 ) -> dict[str, np.ndarray]:
     """Make the true arrays, with one storage in memory at a time."""
     arrays = {
-        key: np.asarray(value.array()) for key, value in stored.items() if isinstance(value, StoredArray)
+        key: np.asarray(value.array()) for key, value in stored.items() if isinstance(value, PickledArray)
     }
-    sharing: dict[tuple[str, str], dict[str, StoredTensor]] = {}
+    sharing: dict[tuple[str, str], dict[str, PickledTensor]] = {}
     for key, value in stored.items():
-        if isinstance(value, StoredTensor):
+        if isinstance(value, PickledTensor):
             sharing.setdefault((value.storage.key, value.storage.dtype.name), {})[key] = value
     for tensors in sharing.values():
         numbers = file.numbers(next(iter(tensors.values())).storage)

@@ -11,7 +11,7 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.atomic import whole_file
-from poem_jax.io.seal import check_seal, write_seal
+from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.models.poem import init
 from poem_jax.training.config import TrainConfig, config_json, differences, flatten_config, git_commit
 from poem_jax.training.state import TrainState, create_state, evaluation_params
@@ -66,7 +66,7 @@ class Checkpoints:
                 seal.unlink()
         for step in steps:
             if not self._seal(step).is_file():
-                write_seal(self._seal(step), self.run_dir / _FOLDER / str(step))
+                write_checksums(self._seal(step), self.run_dir / _FOLDER / str(step))
 
     @property
     def latest_step(self) -> int | None:
@@ -101,7 +101,7 @@ class Checkpoints:
             raise FileNotFoundError(f"no checkpoint in {self.run_dir / _FOLDER}")
         template = flatten(like)
         try:
-            check_seal(self._seal(step), self.run_dir / _FOLDER / str(step))
+            check_checksums(self._seal(step), self.run_dir / _FOLDER / str(step))
             leaves = self._orbax.load(step, template)
         except Exception as error:
             # Orbax and TensorStore raise many kinds; each means that the arrays cannot be read.

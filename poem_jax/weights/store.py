@@ -1,4 +1,4 @@
-"""Weights on disk: `config.json`, `ckpt/` (an Orbax checkpoint) and `seal.json` (its digests).
+"""Weights on disk: `config.json`, `ckpt/` (an Orbax checkpoint) and `seal.json` (the checksums of its files).
 
 The config travels with the weights, so that a checkpoint loads without its experiment file. Writing goes to a
 temporary folder beside the target, which is renamed when it is whole.
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from poem_jax.io.seal import check_seal, write_seal
+from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.models.config import Config
 from poem_jax.models.config_json import from_json, to_json
 from poem_jax.models.parameters import describe
@@ -24,7 +24,7 @@ from poem_jax.typing import Array, Params, PyTree
 
 CONFIG_FILE = "config.json"
 ARRAYS_FOLDER = "ckpt"
-SEAL_FILE = "seal.json"
+CHECKSUMS_FILE = "seal.json"
 SHIPPED = Path(__file__).parent / "tiny"
 """The weights that come with the package."""
 
@@ -60,7 +60,7 @@ def save(
     try:
         (temporary / CONFIG_FILE).write_text(to_json(config) + "\n", encoding="utf-8")
         ocp.save(str((temporary / ARRAYS_FOLDER).resolve()), stored)
-        write_seal(temporary / SEAL_FILE, temporary / ARRAYS_FOLDER)
+        write_checksums(temporary / CHECKSUMS_FILE, temporary / ARRAYS_FOLDER)
         temporary.chmod(0o755)
         _put_in_place(temporary, path)
     finally:
@@ -217,7 +217,7 @@ def _read_config(path: Path) -> Config:
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     folder = path / ARRAYS_FOLDER
     try:
-        check_seal(path / SEAL_FILE, folder)
+        check_checksums(path / CHECKSUMS_FILE, folder)
         return cast(dict[str, np.ndarray], ocp.load(str(folder.resolve())))
     except Exception as error:
         # Orbax and TensorStore raise many kinds; each means that the arrays cannot be read.

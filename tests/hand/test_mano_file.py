@@ -2,6 +2,7 @@
 
 import pickle
 import sys
+from collections import OrderedDict
 from pathlib import Path
 from types import ModuleType
 
@@ -86,11 +87,74 @@ def test_reads_a_pickle_like_manos(tmp_path: Path, foreign, protocol: int, monke
     _same(load(path))
 
 
-@pytest.mark.parametrize("make", [sparse.csc_matrix, sparse.csr_matrix, sparse.csc_array])
+FORMS = ("csc", "csr", "coo", "lil", "dia", "bsr")
+
+
+@pytest.mark.filterwarnings("ignore:Constructing a DIA matrix")
+@pytest.mark.parametrize("make", [getattr(sparse, f"{f}_{k}") for f in FORMS for k in ("matrix", "array")])
 def test_reads_sparse_regressors(tmp_path: Path, make):
     path = tmp_path / "MANO_LEFT.pkl"
     path.write_bytes(pickle.dumps({**_fields(), "J_regressor": make(_fields()["J_regressor"])}))
     _same(load(path), side="left")
+
+
+def test_reads_ordered_dicts(tmp_path: Path):
+    path = tmp_path / "MANO_RIGHT.pkl"
+    path.write_bytes(pickle.dumps(OrderedDict(_fields())))
+    _same(load(path))
+
+
+def _left_fields() -> dict:
+    left = default_hand("left")
+    names = ("v_template", "shapedirs", "posedirs")
+    return {**_fields(), **{name: getattr(left, name) for name in names}, "f": left.faces}
+
+
+def test_the_published_left_hand_is_mended_with_a_warning(tmp_path: Path, caplog):
+    """Its `shapedirs` are those of the right hand in x; what they should be is the mirror image."""
+    path = tmp_path / "MANO_LEFT.pkl"
+    path.write_bytes(pickle.dumps({**_left_fields(), "shapedirs": _fields()["shapedirs"]}))
+    model = load(path)
+    assert model.side == "left"
+    for got, expected in zip(model, default_hand("left"), strict=True):
+        np.testing.assert_array_equal(got, expected)
+    (message,) = caplog.messages
+    assert "the x components of `shapedirs`" in message
+    assert "known fault of the published MANO_LEFT.pkl" in message
+
+
+@pytest.mark.parametrize(("side", "fields"), [("left", _left_fields()), ("right", _fields())])
+def test_sound_hands_are_left_alone(side, fields, tmp_path: Path, caplog):
+    path = tmp_path / f"MANO_{side.upper()}.pkl"
+    path.write_bytes(pickle.dumps(fields))
+    for got, expected in zip(load(path), default_hand(side), strict=True):
+        np.testing.assert_array_equal(got, expected)
+    assert caplog.messages == []
+
+
+def test_a_left_hand_whose_shape_says_nothing_is_read_with_a_warning(tmp_path: Path, caplog):
+    path = tmp_path / "MANO_LEFT.pkl"
+    path.write_bytes(pickle.dumps({**_left_fields(), "shapedirs": np.zeros((778, 3, 10))}))
+    assert not load(path).shapedirs.any()
+    assert "whether they are mirrored with the hand" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["left_of_RIGHT.pkl", "hand.pkl"])
+@pytest.mark.parametrize(("side", "fields"), [("left", _left_fields()), ("right", _fields())])
+def test_the_hand_tells_its_side_where_the_name_does_not(name, side, fields, tmp_path: Path, caplog):
+    path = tmp_path / name
+    path.write_bytes(pickle.dumps(fields))
+    assert load(path).side == side
+    assert caplog.messages == []
+
+
+def test_a_name_that_contradicts_the_hand_is_told(tmp_path: Path, caplog):
+    path = tmp_path / "MANO_RIGHT.pkl"
+    path.write_bytes(pickle.dumps(_left_fields()))
+    assert load(path).side == "right"
+    assert (
+        "read as a right hand after its name, but its fingers point along +x as a left hand's" in caplog.text
+    )
 
 
 def test_reads_an_npz(tmp_path: Path):
@@ -231,13 +295,13 @@ def test_other_files_are_named(tmp_path: Path):
         load(tmp_path / "MANO_RIGHT.pkl")
     text = tmp_path / "notes.npz"
     text.write_text("no archive")
-    with pytest.raises(ValueError, match=r"notes\.npz must be an \.npz of arrays"):
+    with pytest.raises(ValueError, match=r"notes\.npz must be an npz of plain arrays"):
         load(text)
     whole = tmp_path / "whole.npz"
     np.savez(whole, **_fields())
     cut = tmp_path / "cut.npz"
     cut.write_bytes(whole.read_bytes()[:5000])
-    with pytest.raises(ValueError, match="cut short or of another kind"):
+    with pytest.raises(ValueError, match="cut short, damaged or of another kind"):
         load(cut)
     array = tmp_path / "list.pkl"
     array.write_bytes(pickle.dumps([1, 2]))
@@ -246,7 +310,7 @@ def test_other_files_are_named(tmp_path: Path):
     single = tmp_path / "single.npz"
     with single.open("wb") as stream:
         np.save(stream, np.zeros(3))
-    with pytest.raises(ValueError, match=r"single array \(\.npy\); save all of MANO's fields"):
+    with pytest.raises(ValueError, match=r"one array without a name \(\.npy\); save it with numpy"):
         load(single)
     other = tmp_path / "hand.obj"
     other.write_text("v 0 0 0")

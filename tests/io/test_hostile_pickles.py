@@ -96,7 +96,7 @@ def test_pickles_that_could_crash_are_refused(name: str):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (np.dtype("f8"), "StoredDtype is no data"),
+        (np.dtype("f8"), "PickledDtype is no data"),
         (np.ndarray, "is no data"),
         (Made(_RECONSTRUCT, (np.ndarray, (0,), b"b")), "announced but never given"),
         (Made(_RECONSTRUCT, (np.ndarray, (4,), b"O")), "must start empty"),
@@ -115,7 +115,7 @@ def test_pickles_that_could_crash_are_refused(name: str):
         (Made(set, ([(1, 2)],)), "keys must be text or numbers; got a tuple"),
         (Made(set, ("abc",)), "must be given its members in a list"),
         ({(1, 2): 3}, "keys must be text or numbers; got a tuple"),
-        ({np.float32(1): 3}, "keys must be text or numbers; got a StoredArray"),
+        ({np.float32(1): 3}, "keys must be text or numbers; got a PickledArray"),
     ],
 )
 def test_what_numpy_would_not_write_is_named(value, message: str):

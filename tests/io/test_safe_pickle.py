@@ -61,7 +61,7 @@ def test_old_and_new_names_of_numpy_are_read(core: str):
         ("numpy", "load"),
         ("numpy.core.multiarray", "fromfile"),
         ("numpy.testing._private.utils", "runstring"),
-        ("collections", "OrderedDict"),
+        ("collections", "defaultdict"),
         ("torch.storage", "_load_from_bytes"),
     ],
 )
@@ -136,8 +136,24 @@ def test_text_and_missing_files_are_named(tmp_path):
         load_arrays_pickle(tmp_path / "none.pkl")
 
 
-def test_persistent_objects_and_ordered_dicts_are_refused():
+def test_persistent_objects_are_refused():
     with pytest.raises(ValueError, match="outside itself"):
         loads_arrays_pickle(b"Psomewhere\n.")
-    with pytest.raises(ValueError, match=r"collections\.OrderedDict"):
-        loads_arrays_pickle(pickle.dumps(OrderedDict(a=1)))
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_ordered_dicts_are_read(protocol: int):
+    value = OrderedDict(b=np.ones(2), a=OrderedDict(c=1))
+    read = loads_arrays_pickle(pickle.dumps(value, protocol=protocol))
+    assert list(read) == ["b", "a"]
+    assert read["a"] == {"c": 1}
+    np.testing.assert_array_equal(read["b"], value["b"])
+
+
+def test_rows_of_lists_are_read_and_no_other_objects():
+    rows = np.empty(2, object)
+    rows[:] = [[1, 2.5], []]
+    assert loads_arrays_pickle(pickle.dumps(rows)) == [[1, 2.5], []]
+    for other in (np.array([{}], object), np.array([[None]], object), np.array([print], object)):
+        with pytest.raises(ValueError, match=r"refused"):
+            loads_arrays_pickle(pickle.dumps(other))

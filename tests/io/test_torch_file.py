@@ -226,7 +226,7 @@ def test_numpy_arrays_in_a_state_dict_are_read(read, form: str):
 @pytest.mark.parametrize("form", FORMS)
 def test_files_without_one_state_dict_are_named(read, form: str):
     floats = tensor(storage(form))
-    with pytest.raises(ValueError, match="must hold a dict; got a StoredTensor"):
+    with pytest.raises(ValueError, match="must hold a dict; got a PickledTensor"):
         read(form, floats)
     two = {"generator": dict_of({"a": floats}), "critic": dict_of({"a": floats}), "epoch": plain(1)}
     with pytest.raises(
@@ -435,7 +435,7 @@ def hostile(form: str, trace: str) -> dict[str, tuple[bytes, str]]:
         "key that climbs": (dict_of({"a": tensor(storage(form, key="../version"))}), "got 0|must hold the 1"),
         "key of a dict": (
             b"}" + floats + plain(1) + b"s",
-            "keys must be text or numbers; got a StoredTensor",
+            "keys must be text or numbers; got a PickledTensor",
         ),
         "one list copied again and again": (
             plain(list(range(20_000))) + b"q\x00" + call(name("torch", "Size"), b"h\x00") * 100,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 _CODES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+_OBJECT_CODES = ("O8", "O4")
 _ORDERS = ("<", ">", "|")
 _MOST_DIMENSIONS = 32
 _LARGEST_BYTES = 2**40
@@ -27,7 +28,7 @@ def refuse_change(name: str) -> None:
     raise ValueError(f"{name} may not be changed")
 
 
-class StoredDtype:
+class PickledDtype:
     """A type of plain numbers: a code such as "f8", and a byte order set once."""
 
     __slots__ = ("_code", "_order")
@@ -60,25 +61,42 @@ class StoredDtype:
         return np.dtype(self._code).newbyteorder(self._order or "=")
 
 
-class StoredArray:
+class ObjectDtype:
+    """The type of Python objects, read for one purpose: rows of lists of numbers (SciPy's LIL matrices)."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        """Take (3, "|", None, None, None, -1, -1, flags), as NumPy writes it."""
+        whole = isinstance(state, tuple) and len(state) == 8 and _latin1(state[1]) == "|"
+        if not whole or not _is_plain_state((*state[:7], 0)):
+            raise ValueError("the state of a dtype of objects is not one that NumPy writes")
+
+
+def describe_dtype(code: Any, *flags: Any) -> PickledDtype | ObjectDtype:
+    """Describe a dtype by the arguments that `numpy.dtype` gives to its own pickles."""
+    return ObjectDtype() if _latin1(code) in _OBJECT_CODES else PickledDtype(code, *flags)
+
+
+class PickledArray:
     """An array or scalar that a pickle describes: first empty, then filled once."""
 
-    __slots__ = ("_dtype", "_order", "_raw", "_scalar", "_shape")
+    __slots__ = ("_dtype", "_order", "_raw", "_rows", "_scalar", "_shape")
     __hash__ = None  # type: ignore[assignment]
 
     def __init__(self) -> None:
         """Start empty: `fill` or `__setstate__` follows."""
         self._raw: bytes | None = None
+        self._rows: list | None = None
 
-    def fill(self, shape: Any, dtype: Any, order: str, data: Any, scalar: bool = False) -> "StoredArray":
+    def fill(self, shape: Any, dtype: Any, order: str, data: Any, scalar: bool = False) -> "PickledArray":
         """Take the contents; return self.
 
         Raises:
             ValueError: already filled; not plain numbers; a shape or a byte count that do not fit.
         """
-        if self._raw is not None:
-            refuse_change("a finished array")
-        if not isinstance(dtype, StoredDtype):
+        self._refuse_second_contents()
+        if not isinstance(dtype, PickledDtype):
             raise ValueError(f"an array's type must be a dtype of numbers; got a {type(dtype).__name__}")
         if isinstance(data, str):
             data = data.encode("latin1")
@@ -96,7 +114,21 @@ class StoredArray:
         shape, dtype, is_fortran, data = state[-4:]
         if type(is_fortran) not in (bool, int):
             raise ValueError("the state of an array is not one that NumPy writes")
-        self.fill(shape, dtype, "F" if is_fortran else "C", data)
+        if isinstance(dtype, ObjectDtype):
+            self._fill_with_rows(shape, data)
+        else:
+            self.fill(shape, dtype, "F" if is_fortran else "C", data)
+
+    def _fill_with_rows(self, shape: Any, rows: Any) -> None:
+        self._refuse_second_contents()
+        whole = isinstance(rows, list) and shape == (len(rows),) and all(isinstance(r, list) for r in rows)
+        if not whole:
+            raise ValueError("dtype 'O8' is refused: of arrays of Python objects only rows of lists are read")
+        self._rows = rows
+
+    def _refuse_second_contents(self) -> None:
+        if self._raw is not None or self._rows is not None:
+            refuse_change("a finished array")
 
     @property
     def nbytes(self) -> int:
@@ -104,11 +136,13 @@ class StoredArray:
         return len(self._raw or b"")
 
     def array(self) -> Any:
-        """Make the true array (a copy, writable) or scalar.
+        """Make the true array (a copy, writable) or scalar, or of rows of lists these lists, unchecked.
 
         Raises:
             ValueError: the pickle never gave its contents.
         """
+        if self._rows is not None:
+            return self._rows
         if self._raw is None:
             raise ValueError("an array was announced but never given")
         flat = np.frombuffer(self._raw, dtype=self._dtype)
@@ -155,7 +189,7 @@ class TensorStorage:
         return part
 
 
-class StoredTensor:
+class PickledTensor:
     """A view of a storage: `shape`, and by how many numbers each axis steps."""
 
     __slots__ = ("_offset", "_strides", "shape", "storage")

@@ -11,8 +11,8 @@ from typing import Any
 import ml_dtypes
 import numpy as np
 
-from poem_jax.io.safe_pickle import Inert, Vocabulary, check_keys, describe_pickle
-from poem_jax.io.stored_array import StoredTensor, TensorStorage
+from poem_jax.io.pickled_arrays import PickledTensor, TensorStorage
+from poem_jax.io.safe_pickle import Inert, Vocabulary, describe_pickle
 
 DTYPES = {
     "HalfStorage": np.dtype(np.float16),
@@ -30,16 +30,6 @@ DTYPES = {
 _UNTYPED = ("UntypedStorage", "_UntypedStorage", "TypedStorage", "_TypedStorage")
 
 
-class _Dict(dict):
-    """An OrderedDict or Counter; the attributes that a pickle sets on it (`_metadata`) are dropped."""
-
-    __slots__ = ()
-
-    def __setstate__(self, state: Any) -> None:
-        if not isinstance(state, dict):
-            raise ValueError(f"the attributes of a dict must come in a dict; got a {type(state).__name__}")
-
-
 class _StorageType(Inert):
     """The type of a storage: it only tells the type of the numbers."""
 
@@ -50,18 +40,6 @@ class _StorageType(Inert):
         self.dtype = dtype
 
 
-def _make_dict(items: Any = ()) -> _Dict:
-    """Build from nothing, from another dict, or from a list of pairs, as Python 2 wrote it."""
-    pairs = list(items.items()) if isinstance(items, dict) else items
-    whole = isinstance(pairs, list | tuple) and all(
-        isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs
-    )
-    if not whole:
-        raise ValueError("a dict must be given as pairs of key and value")
-    check_keys([key for key, _ in pairs])
-    return _Dict(pairs)
-
-
 def _make_tensor(
     storage: Any,
     offset: Any,
@@ -70,16 +48,16 @@ def _make_tensor(
     requires_grad: Any = False,
     hooks: Any = None,
     pending: Any = None,
-) -> StoredTensor:
+) -> PickledTensor:
     """What `torch._utils._rebuild_tensor` and `_v2` take."""
     if pending:
         raise ValueError("a tensor with a pending negation or conjugation is not read")
-    return StoredTensor(storage, offset, size, stride)
+    return PickledTensor(storage, offset, size, stride)
 
 
-def _make_parameter(data: Any, *unused: Any) -> StoredTensor:
+def _make_parameter(data: Any, *unused: Any) -> PickledTensor:
     """A parameter is its tensor; `unused`: gradient, hooks, attributes."""
-    if not isinstance(data, StoredTensor):
+    if not isinstance(data, PickledTensor):
         raise ValueError(f"a parameter must be a tensor; got a {type(data).__name__}")
     return data
 
@@ -97,8 +75,6 @@ def _make_device(*parts: Any) -> tuple:
 
 
 _MAKERS = {
-    ("collections", "OrderedDict"): _make_dict,
-    ("collections", "Counter"): _make_dict,
     ("torch", "Size"): _make_size,
     ("torch", "device"): _make_device,
     ("torch._utils", "_rebuild_tensor"): _make_tensor,
