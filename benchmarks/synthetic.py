@@ -18,7 +18,7 @@ import numpy as np
 from poem_jax.synthetic.dataset import SyntheticDataset
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from configs.synthetic_benchmark import benchmark
+from poem_jax.experiments.synthetic_benchmark import benchmark
 
 VIEWS = 4
 CHUNK = 16

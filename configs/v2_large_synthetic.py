@@ -1,20 +1,3 @@
-"""POEM v2-large (width 512) with the paper's recipe, on endless synthetic captures at 256 x 256.
+"""`v2_large_synthetic`, which stands in poem_jax/experiments/."""
 
-What:      as configs/v2_base_synthetic.py, with another model.
-Hardware:  as there.
-Time:      not run to its end here.
-Expected:  no number of ours yet.
-Command:   python train.py configs/v2_large_synthetic.py
-"""
-
-from dataclasses import replace
-
-from configs.v2_base_synthetic import config as base
-from poem_jax.models.presets import preset
-
-config = replace(
-    base,
-    name="v2_large_synthetic",
-    model=preset("v2-large"),
-    train=replace(base.train, out="runs/v2_large_synthetic"),
-)
+from poem_jax.experiments.v2_large_synthetic import config as config

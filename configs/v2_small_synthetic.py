@@ -1,20 +1,3 @@
-"""POEM v2-small (width 128) with the paper's recipe, on endless synthetic captures at 256 x 256.
+"""`v2_small_synthetic`, which stands in poem_jax/experiments/."""
 
-What:      as configs/v2_base_synthetic.py, with another model.
-Hardware:  as there.
-Time:      not run to its end here.
-Expected:  no number of ours yet.
-Command:   python train.py configs/v2_small_synthetic.py
-"""
-
-from dataclasses import replace
-
-from configs.v2_base_synthetic import config as base
-from poem_jax.models.presets import preset
-
-config = replace(
-    base,
-    name="v2_small_synthetic",
-    model=preset("v2-small"),
-    train=replace(base.train, out="runs/v2_small_synthetic"),
-)
+from poem_jax.experiments.v2_small_synthetic import config as config

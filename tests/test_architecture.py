@@ -10,7 +10,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "poem_jax"
 FLOORS = {
-    "cli": 9,
+    "cli": 10,
+    "experiments": 9,
     "training": 8,
     "capture": 8,
     "evaluation": 7,

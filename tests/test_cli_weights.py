@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 
 import poem_jax
-from poem_jax import cli
 from poem_jax.cli import USAGE_ERROR, main
+from poem_jax.cli.export_torch import ExportTorch
+from poem_jax.cli.import_torch import ImportTorch
+from poem_jax.cli.run import parse
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.template import default_hand
@@ -256,7 +258,7 @@ def test_nothing_but_a_model_is_replaced(tmp_path, capsys, release):
     assert "photos is not replaced, for it is no model folder" in capsys.readouterr().err
     file = tmp_path / "photos" / "hand.jpg"
     assert main([*release.command(file), "--overwrite"]) == USAGE_ERROR
-    assert "must name a folder; got the file" in capsys.readouterr().err
+    assert "the results go to a folder" in capsys.readouterr().err
     assert file.read_text() == "mine"
     (tmp_path / "empty").mkdir()
     assert main([*release.command(tmp_path / "empty"), "--overwrite"]) == 0
@@ -374,7 +376,7 @@ def test_unknown_variants_are_usage_errors(tmp_path, capsys, small_release):
         main(small_release.command(tmp_path / "out", "v2-huge"))
     assert stop.value.code == USAGE_ERROR
     assert "v2-medium-mano" in capsys.readouterr().err
-    assert get_args(get_type_hints(cli.ImportTorch)["variant"]) == VARIANTS
+    assert get_args(get_type_hints(ImportTorch)["variant"]) == VARIANTS
 
 
 # Export.
@@ -412,7 +414,7 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(tmp_path, capsys
         ("tiny", "new/a.pth", [], "only the released models can be exported"),
         ("tiny", "mine.pth", ["--overwrite"], "only the released models can be exported"),
         ("tiny", "mine.pth", [], "mine.pth exists already; give another name, or --overwrite"),
-        ("tiny", "tiny", ["--overwrite"], "`out` must name a file; got the folder"),
+        ("tiny", "tiny", ["--overwrite"], "it is a folder; give another --out"),
         ("none", "new/a.pth", [], "no checkpoint at"),
     ):
         assert main(["export-torch", str(tmp_path / model), "--out", str(tmp_path / out), *options]) == 2
@@ -430,10 +432,8 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(tmp_path, capsys
 def test_the_commands_of_the_document_are_understood():
     blocks = re.findall(r"```\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    commands = [
-        cli._parse(shlex.split(line, comments=True)[1:]) for line in lines if line.startswith("poem ")
-    ]
-    assert {cli.ImportTorch, cli.ExportTorch} <= {type(command) for command in commands}
+    commands = [parse(shlex.split(line, comments=True)[1:]) for line in lines if line.startswith("poem ")]
+    assert {ImportTorch, ExportTorch} <= {type(command) for command in commands}
 
 
 def test_the_document_names_fields_and_values_of_the_config():

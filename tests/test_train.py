@@ -56,16 +56,16 @@ def run_train(*arguments, **environment):
 
 def test_wrong_commands_say_what_is_wrong(experiment, tmp_path):
     missing = run_train(tmp_path / "absent.py")
-    assert missing.returncode == 1
+    assert missing.returncode == 2
     assert "experiment file not found" in missing.stderr
     unknown = run_train(experiment, "--train.stepz", 3)
     assert unknown.returncode == 2
     assert "--train.stepz" in unknown.stderr
     odd = run_train(experiment, "--train.host-devices", 3)
-    assert odd.returncode != 0
+    assert odd.returncode == 2
     assert "every `batch_size`" in odd.stderr
     nothing = run_train(experiment, "--export", tmp_path / "model")
-    assert nothing.returncode == 1
+    assert nothing.returncode == 2
     assert "no checkpoints in" in nothing.stderr
 
 

@@ -6,7 +6,6 @@ same on every run.
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import cv2
@@ -17,13 +16,11 @@ from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_b
 from poem_jax.capture.demo import GROUND_TRUTH, demo_folder
 from poem_jax.capture.outputs import write_arrays
 from poem_jax.data.transforms import box_from_center
+from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.geometry.cameras import crop_homography, crop_intrinsics, invert_intrinsics, project
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.atomic import whole_file
 from poem_jax.synthetic.dataset import Scene, SyntheticDataset, render_view
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from configs.synthetic_benchmark import benchmark
 
 SEED, INDEX, NUM_VIEWS = 0, 0, 4
 SIDE = 512

@@ -8,12 +8,12 @@ anything is written; a frame in which a hand cannot be fitted is marked, and sto
 import logging
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from poem_jax.calibration.rig_json import read_rig
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_boxes, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
@@ -21,6 +21,7 @@ from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
+from poem_jax.capture.rig_file import find_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.capture.take import FrameOutcome, HandOutcome, Take, read_frame
 from poem_jax.geometry.distortion import distort_pixels, undistort_pixels
@@ -61,20 +62,23 @@ def hands_of(model: HandModel) -> Hands:
 
 
 def read_keypoint_take(
-    keypoints: str | os.PathLike, rig: str | os.PathLike, images: str | os.PathLike | None = None
+    keypoints: str | os.PathLike,
+    rig: str | os.PathLike | None = None,
+    images: str | os.PathLike | None = None,
 ) -> Take:
     """Read key points and rig; the frames are those of the key-point file.
 
     Args:
         keypoints: File of key points.
-        rig: Rig file.
+        rig: Rig file; None = `rig.json` or `calibration/rig.json` in the folder `images` where that is given,
+            else beside the key points.
         images: Capture folder to draw on; its frames are found by name. None = no images.
 
     Raises:
         FileNotFoundError: A file, or every image, is missing.
         ValueError: One of them is wrong, they have different numbers of views, or no name of a frame fits.
     """
-    found = read_rig(rig)
+    found = find_rig(Path(keypoints).parent if images is None else images, rig)
     hands = read_boxes(keypoints)
     if hands.keypoints_px is None:
         raise ValueError(

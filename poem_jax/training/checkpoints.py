@@ -1,6 +1,8 @@
 """Checkpoints of a run: Orbax, asynchronous and atomic, with the config and the commit beside them."""
 
 import json
+import logging
+import shutil
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,9 +20,12 @@ from poem_jax.training.state import TrainState, create_state, evaluation_params
 from poem_jax.weights.store import check_leaves, flatten, save, unflatten
 
 _FOLDER = "checkpoints"
-_SEALS = "seals"
+_CHECKSUMS = "seals"
+_SET_ASIDE = "damaged"
 _CONFIG = "train_config.json"
 _COMMIT = "git_commit.txt"
+
+_log = logging.getLogger(__name__)
 
 
 class Checkpoints:
@@ -44,6 +49,8 @@ class Checkpoints:
             preservation_policy=keep,  # pyright: ignore[reportArgumentType] - Orbax's own two spellings
             cleanup_tmp_directories=not read_only,
         )
+        self._written: int | None = None
+        """The step that is being written, or is written and has no checksums yet."""
 
     def __enter__(self) -> "Checkpoints":
         return self
@@ -58,21 +65,39 @@ class Checkpoints:
             self._orbax.close()
 
     def finish(self) -> None:
-        """Wait for the write in the background, and seal what is new; seals of removed steps go."""
+        """Wait for the write in the background, and write the checksums of what it wrote."""
         self._orbax.wait()
-        steps = {saved.step for saved in self._orbax.checkpoints}
-        for seal in (self.run_dir / _SEALS).glob("*.json"):
-            if seal.stem not in map(str, steps):
-                seal.unlink()
-        for step in steps:
-            if not self._seal(step).is_file():
-                write_checksums(self._seal(step), self.run_dir / _FOLDER / str(step))
+        self.write_checksums_of_what_is_written()
+
+    def write_checksums_of_what_is_written(self) -> None:
+        """Write the checksums of the checkpoint that the background has finished, if it has; those of removed
+        steps go.
+
+        Only of what this sitting wrote: a checkpoint without checksums is one whose writing nobody saw to its
+        end.
+        """
+        if self._written is None or self._orbax.is_saving_in_progress():
+            return
+        write_checksums(self._checksums(self._written), self._folder(self._written))
+        self._written = None
+        for file in (self.run_dir / _CHECKSUMS).glob("*.json"):
+            if not (self.run_dir / _FOLDER / file.stem).is_dir():
+                file.unlink()
+
+    @property
+    def config_file(self) -> Path:
+        """The resolved config of the run."""
+        return self.run_dir / _CONFIG
 
     @property
     def latest_step(self) -> int | None:
-        """Step of the newest whole checkpoint."""
-        latest = self._orbax.latest
-        return None if latest is None else latest.step
+        """Step of the newest checkpoint."""
+        return max(self.steps, default=None)
+
+    @property
+    def steps(self) -> list[int]:
+        """Steps of all checkpoints, the newest first."""
+        return sorted((saved.step for saved in self._orbax.checkpoints), reverse=True)
 
     def save(self, state: TrainState, *, wait: bool = False) -> None:
         """Write the state in the background; an earlier write is finished first.
@@ -83,41 +108,87 @@ class Checkpoints:
         step = int(state.step)
         if step == self.latest_step:
             return
-        self._seal(step).unlink(missing_ok=True)
+        self._checksums(step).unlink(missing_ok=True)
         leaves = flatten(jax.tree.map(jnp.copy, state))
         self._orbax.save_async(step, leaves, force=True, custom_metadata=self._meta)
+        self._written = step
         if wait:
             self.finish()
 
-    def restore(self, like: TrainState, step: int | None = None) -> TrainState:
-        """Read a checkpoint (the newest by default) onto the devices and shardings of `like`.
+    def restore(self, like: TrainState) -> TrainState:
+        """Read the newest sound checkpoint onto the devices and shardings of `like`.
+
+        One that is damaged, or has no checksums since the run ended while it was written, is named in a
+        warning and set aside, and the one before it is taken: a run that goes on from there computes the
+        same. Only where none with checksums is left is the newest one taken unchecked, with a warning.
 
         Raises:
             FileNotFoundError: there is no checkpoint.
-            ValueError: it is damaged, or its arrays do not fit `like`.
+            ValueError: none can be read, or their arrays do not fit `like`.
         """
-        step = self.latest_step if step is None else step
-        if step is None:
+        if not self.steps:
             raise FileNotFoundError(f"no checkpoint in {self.run_dir / _FOLDER}")
+        problems: list[str] = []
+        checked = [step for step in self.steps if self._checksums(step).is_file()]
+        unchecked = [step for step in self.steps if step not in sealed]
+        for step in checked + unchecked:
+            try:
+                state = self._read(step, like)
+            except ValueError as error:
+                problems.append(str(error))
+                continue
+            newer = [other for other in self.steps if other > step]
+            problems += [self._without_checksums(other) for other in newer if other in unchecked]
+            if step in unchecked:
+                problems.append(
+                    f"{self._without_checksums(step)}; it is taken unchecked, for want of one that has them"
+                )
+            for problem in problems:
+                _log.warning("%s", problem)
+            self._set_aside(newer)
+            return state
+        raise ValueError(
+            f"{'; '.join(problems)}. Remove that step's folder to begin anew, or choose another --train.out"
+        )
+
+    def _read(self, step: int, like: TrainState) -> TrainState:
         template = flatten(like)
         try:
-            check_checksums(self._seal(step), self.run_dir / _FOLDER / str(step))
+            check_checksums(self._checksums(step), self._folder(step))
             leaves = self._orbax.load(step, template)
+            check_leaves(leaves, template, f"checkpoint {step}")
         except Exception as error:
             # Orbax and TensorStore raise many kinds; each means that the arrays cannot be read.
             raise ValueError(
                 f"checkpoint {step} in {self.run_dir / _FOLDER} is damaged or belongs to another model "
-                f"({type(error).__name__}: {str(error)[:300]}). Remove that step's folder to go on from an "
-                "older one, or choose another --train.out"
+                f"({type(error).__name__}: {str(error)[:300]})"
             ) from error
-        check_leaves(leaves, template, f"checkpoint {step} in {self.run_dir}")
         return unflatten(leaves, like)
 
-    def _seal(self, step: int) -> Path:
-        return self.run_dir / _SEALS / f"{step}.json"
+    def _without_checksums(self, step: int) -> str:
+        return f"checkpoint {step} in {self.run_dir / _FOLDER} has no checksums: the run ended while it was written"
+
+    def _set_aside(self, steps: list[int]) -> None:
+        """Move checkpoints to where nothing takes them for good ones, unless the run is only read."""
+        if self._read_only or not steps:
+            return
+        for step in steps:
+            folder = self.run_dir / _SET_ASIDE / str(step)
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.parent.mkdir(exist_ok=True)
+            self._folder(step).rename(folder)
+            self._checksums(step).unlink(missing_ok=True)
+            _log.warning("it is now %s; training goes on from the checkpoint before it", folder)
+        self._orbax.reload()
+
+    def _folder(self, step: int) -> Path:
+        return self.run_dir / _FOLDER / str(step)
+
+    def _checksums(self, step: int) -> Path:
+        return self.run_dir / _CHECKSUMS / f"{step}.json"
 
     def _write_identity(self) -> None:
-        with whole_file(self.run_dir / _CONFIG) as file:
+        with whole_file(self.config_file) as file:
             file.write_text(config_json(self.config) + "\n", encoding="utf-8")
         with whole_file(self.run_dir / _COMMIT) as file:
             file.write_text(self._meta["git_commit"] + "\n", encoding="utf-8")

@@ -1,14 +1,11 @@
-"""What an experiment is: frozen dataclasses nested by owner, written as plain Python in `configs/`.
+"""What an experiment is: frozen dataclasses nested by owner, written as plain Python in `experiments/`.
 
 Importing this module starts no JAX backend, so that an entry point can still choose the devices.
 """
 
 import dataclasses
-import importlib.util
 import json
 import subprocess
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -142,7 +139,8 @@ class RunConfig:
     seed: int = 0
     out: str = "runs/experiment"
     init_from: str | None = None
-    """Folder of a model (`poem_jax.save`, `--export`) that a fresh run starts from; None = random weights."""
+    """Folder of a model (`poem_jax.save`, `--export`) that a fresh run starts from; `shipped`: that of the
+    package; None: random weights."""
     max_minutes: float | None = None
     """Stop after this time, with a checkpoint; the same command goes on from there."""
     log_every: int = 20
@@ -246,49 +244,6 @@ BOOKKEEPING = (
     "data.workers",
 )
 """Fields that may change between two sittings of one run: they do not touch what is learned."""
-
-
-def load_experiment(path: str | Path, name: str = "config") -> Any:
-    """Run a Python file and return its variable `name`.
-
-    A file in a folder called `configs` may import its neighbours as `configs.<name>`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file does not define `name`.
-    """
-    path = Path(path).resolve()
-    if not path.is_file():
-        raise FileNotFoundError(f"experiment file not found: {path}")
-    root = str(path.parent.parent)
-    if path.parent.name == "configs" and root not in sys.path:
-        sys.path.insert(0, root)
-    spec = importlib.util.spec_from_file_location(f"experiment_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    if not hasattr(module, name):
-        raise ValueError(f"{path} must define `{name}`; it defines {sorted(public_names(module))}")
-    return getattr(module, name)
-
-
-def public_names(module: Any) -> set[str]:
-    """Return the names of a module that do not start with an underscore."""
-    return {key for key in vars(module) if not key.startswith("_")}
-
-
-def override(config: TrainConfig, arguments: Sequence[str]) -> TrainConfig:
-    """Apply command-line overrides such as `--train.max-minutes 30`; unknown names end the program."""
-    import tyro
-
-    return tyro.cli(
-        TrainConfig,
-        default=config,
-        args=list(arguments),
-        prog="train.py CONFIG",
-        config=(tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues),
-    )
 
 
 def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:

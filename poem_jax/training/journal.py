@@ -86,10 +86,6 @@ def _is_until(line: str, step: int) -> bool:
 
 
 def _tensorboard(run_dir: Path) -> Any:
-    try:
-        from tensorboardX import SummaryWriter  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ValueError(
-            "`train.tensorboard` needs tensorboardX: pip install 'poem-jax[tensorboard]', or turn it off"
-        ) from error
+    from tensorboardX import SummaryWriter  # pyright: ignore[reportMissingImports]
+
     return SummaryWriter(str(run_dir / "tensorboard"))

@@ -2,12 +2,14 @@
 
 import logging
 import math
+import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import cv2
@@ -17,17 +19,19 @@ import numpy as np
 from poem_jax.batch import MultiViewBatch
 from poem_jax.data.loader import draw_ahead
 from poem_jax.io.atomic import whole_file
+from poem_jax.io.stopping import Stopped
 from poem_jax.models import poem
 from poem_jax.training.checkpoints import Checkpoints
-from poem_jax.training.config import TrainConfig, config_json, git_commit
+from poem_jax.training.config import TrainConfig, git_commit
 from poem_jax.training.journal import Journal
 from poem_jax.training.parallel import Step, check_batch_sizes, compile_step, data_mesh, put_batch, replicated
+from poem_jax.training.preflight import check_before_training
 from poem_jax.training.source import BatchAt, synthetic_batches
 from poem_jax.training.state import TrainState, create_state, restart_moments
 from poem_jax.training.step import Metrics
 from poem_jax.training.validation import Validation
 from poem_jax.typing import Params
-from poem_jax.weights.store import flatten, load
+from poem_jax.weights.store import SHIPPED, flatten, load
 
 log = logging.getLogger(__name__)
 
@@ -46,9 +50,12 @@ def train(config: TrainConfig, *, batch_at: BatchAt | None = None) -> TrainState
 
     Raises:
         FloatingPointError: a metric stopped being finite; names it and the step; no checkpoint is written.
-        ValueError: the run directory belongs to another config, a checkpoint is damaged, or a batch cannot be
-            split over the devices.
+        ModuleNotFoundError: an extra that the run needs is not installed.
+        Stopped: SIGTERM or SIGINT came; the step under way and its checkpoint are finished.
+        ValueError: the run directory belongs to another config or cannot be written to, no checkpoint in it
+            can be read, or a batch cannot be split over the devices.
     """
+    check_before_training(config)
     mesh = data_mesh()
     check_batch_sizes(config, mesh)
     run_dir = Path(config.train.out)
@@ -58,7 +65,7 @@ def train(config: TrainConfig, *, batch_at: BatchAt | None = None) -> TrainState
         state = initial_state(config, checkpoints, mesh)
         first_step = int(state.step)
         batches = draw_ahead(batch_at, first_step, ahead=config.data.prefetch, workers=config.data.workers)
-        with Journal(run_dir, config, first_step) as journal, stop_signals() as stopped:
+        with Journal(run_dir, config, first_step) as journal, stop_after_the_step() as stopped:
             run = _Run(config, mesh, checkpoints, journal, stopped)
             try:
                 return run.go(state, batches)
@@ -74,7 +81,7 @@ def initial_state(config: TrainConfig, checkpoints: Checkpoints, mesh: jax.shard
     log.info("devices %s", [str(device) for device in mesh.devices.flat])
     log.info("%d trainable parameters", count)
     log.info("git commit %s", git_commit())
-    log.info("config %s", config_json(config))
+    log.info("config in %s", checkpoints.config_file)
     if checkpoints.latest_step is not None:
         state = checkpoints.restore(state)
         log.info("resumed at step %d from %s", int(state.step), checkpoints.run_dir)
@@ -83,23 +90,39 @@ def initial_state(config: TrainConfig, checkpoints: Checkpoints, mesh: jax.shard
 
 def _first_params(config: TrainConfig) -> Params:
     if config.train.init_from is not None:
-        return load(config.train.init_from, expected=config.model)[1]
+        folder = SHIPPED if config.train.init_from == "shipped" else config.train.init_from
+        return load(folder, expected=config.model)[1]
     return poem.init(config.model, key=jax.random.key(config.train.seed))
 
 
 @contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """Turn SIGTERM and SIGINT into an event, so that the step under way and its checkpoint are finished."""
+def stop_after_the_step() -> Iterator[threading.Event]:
+    """Turn SIGTERM and SIGINT into an event, so that the step under way and its checkpoint are finished.
+
+    Then `Stopped` is raised; at a second signal at once.
+    """
     event = threading.Event()
+    received: list[signal.Signals] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if received:
+            raise Stopped(signal.Signals(number))
+        received.append(signal.Signals(number))
+        event.set()
+        # Not by `logging`: the signal may have come while a line was being written.
+        os.write(2, b"stopping after this step, with a checkpoint; once more: at once\n")
+
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
-    previous = {kind: signal.signal(kind, lambda *_: event.set()) for kind in (signal.SIGTERM, signal.SIGINT)}
+    previous = {kind: signal.signal(kind, note) for kind in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield event
     finally:
         for kind, handler in previous.items():
             signal.signal(kind, handler)
+    if received:
+        raise Stopped(received[0])
 
 
 class _Run:
@@ -120,6 +143,7 @@ class _Run:
         self.validation = Validation(config, mesh) if config.train.validate_every else None
         self.unread: list[tuple[int, Metrics]] = []
         self.described = False
+        self.compiled: set[tuple[bool, tuple[int, ...]]] = set()
         self.start = self.last_read = time.monotonic()
 
     def go(self, state: TrainState, batches: Iterator[MultiViewBatch]) -> TrainState:
@@ -150,15 +174,26 @@ class _Run:
         return state
 
     def _step(self, step: int, state: TrainState, batch: MultiViewBatch, key: jax.Array) -> TrainState:
-        step_function = self.first_stage_step if step < self.config.first_stage_steps else self.whole_step
+        first_stage = step < self.config.first_stage_steps
+        step_function = self.first_stage_step if first_stage else self.whole_step
+        self._announce(first_stage, batch.views.shape)
         with jax.transfer_guard("disallow"):
             state, metrics = step_function(state, batch, key)
         self.unread.append((step, metrics))
         if len(self.unread) > 1:
             # The host stays one step ahead of the devices, not more.
             jax.block_until_ready(self.unread[-2][1]["loss"])
+        self.checkpoints.write_checksums_of_what_is_written()
         self.journal.advance()
         return state
+
+    def _announce(self, first_stage: bool, shape: tuple[int, ...]) -> None:
+        """Say that a program is compiled, when it is: a minute without news seems a long one."""
+        if (first_stage, shape) in self.compiled:
+            return
+        self.compiled.add((first_stage, shape))
+        part = "first-stage step" if first_stage else "step"
+        log.info("compiling the %s for %d samples of %d views, once", part, *shape[:2])
 
     def _read_metrics(self) -> None:
         """Fetch the metrics since the last time, insist that they are finite, and record their means."""

@@ -26,9 +26,8 @@ def test_the_parts_agree():
     assert mpvpe_mm(shifted) == pytest.approx(5, abs=1e-3)
 
 
-def test_it_is_the_benchmarks_first_sample(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT))
-    from configs.synthetic_benchmark import benchmark
+def test_it_is_the_benchmarks_first_sample():
+    from poem_jax.experiments.synthetic_benchmark import benchmark
     from poem_jax.synthetic.dataset import SyntheticDataset
 
     scene = SyntheticDataset(benchmark, 0).draw_scene(0)

@@ -4,13 +4,13 @@ import shutil
 import subprocess
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
 from poem_jax.batch import MultiViewBatch
+from poem_jax.experiments import experiment_names, open_experiment
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.models.config import HRNetConfig
 from poem_jax.models.parameters import describe
@@ -24,29 +24,17 @@ from poem_jax.training.config import (
     differences,
     flatten_config,
     git_commit,
-    load_experiment,
-    override,
 )
 from poem_jax.training.state import create_state
 from poem_jax.training.step import train_step
 
-ROOT = Path(__file__).resolve().parents[2]
-EXPERIMENTS = sorted(p for p in (ROOT / "configs").glob("*.py") if "\nconfig = " in p.read_text())
+EXPERIMENTS = experiment_names()
 
 
-@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda p: p.stem)
-def test_every_experiment_file_loads(path):
-    config = load_experiment(path)
-    assert config.name == path.stem
-    doc = path.read_text()
-    for part in ("What:", "Hardware:", "Time:", "Expected:", "Command:", f"train.py configs/{path.name}"):
-        assert part in doc
-
-
-@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda p: p.stem)
-def test_every_experiment_builds(path):
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_builds(name):
     """Shapes only; nothing is computed."""
-    config = load_experiment(path)
+    config = open_experiment(name)
     state = jax.eval_shape(partial(create_state, config=config), describe(config.model))
     assert sum(leaf.size for leaf in jax.tree.leaves(state.params["trainable"])) > 1e6
 
@@ -71,17 +59,17 @@ def abstract_batch(config: TrainConfig) -> MultiViewBatch:
     )
 
 
-def traced_quickly_or_slow(path: Path):
+def traced_quickly_or_slow(name: str):
     """Tracing the gradient of the paper's trunk takes about half a minute."""
-    model = load_experiment(path).model
+    model = open_experiment(name).model
     marks = [pytest.mark.slow] if isinstance(model.backbone, HRNetConfig) else []
-    return pytest.param(path, marks=marks, id=path.stem)
+    return pytest.param(name, marks=marks)
 
 
-@pytest.mark.parametrize("path", [traced_quickly_or_slow(path) for path in EXPERIMENTS])
-def test_the_step_of_every_experiment_fits_its_model_and_data(path):
+@pytest.mark.parametrize("name", [traced_quickly_or_slow(name) for name in EXPERIMENTS])
+def test_the_step_of_every_experiment_fits_its_model_and_data(name):
     """Shapes only: the next state has the form of the last, and every metric is a number."""
-    config = load_experiment(path)
+    config = open_experiment(name)
     state = jax.eval_shape(partial(create_state, config=config), describe(config.model))
     key = jax.eval_shape(lambda: jax.random.key(0))
     after, metrics = jax.eval_shape(partial(train_step, config=config), state, abstract_batch(config), key)
@@ -90,25 +78,6 @@ def test_the_step_of_every_experiment_fits_its_model_and_data(path):
     )
     assert {"loss", "mpvpe_mm", "keypoint_px", "gradient_norm"} <= metrics.keys()
     assert all(value.shape == () for value in metrics.values())
-
-
-def test_load_experiment_errors(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"experiment file not found: .*absent\.py"):
-        load_experiment(tmp_path / "absent.py")
-    (tmp_path / "empty.py").write_text("other = 1\n")
-    with pytest.raises(ValueError, match=r"must define `config`; it defines .*other"):
-        load_experiment(tmp_path / "empty.py")
-
-
-def test_overrides_are_typed_and_unknown_ones_fail(micro_config, capsys):
-    changed = override(
-        micro_config, ["--train.max-minutes", "1.5", "--loss.layers", "last", "--model.width", "32"]
-    )
-    assert (changed.train.max_minutes, changed.loss.layers.value, changed.model.width) == (1.5, "last", 32)
-    assert override(micro_config, []) == micro_config
-    for wrong in (["--train.stepz", "3"], ["--train.steps", "many"]):
-        with pytest.raises(SystemExit):
-            override(micro_config, wrong)
 
 
 def test_cross_field_rules(micro_config):

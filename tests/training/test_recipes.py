@@ -1,7 +1,7 @@
 import pytest
 
-from configs.synthetic_benchmark import benchmark
 from poem_jax import losses
+from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.models.presets import preset
 from poem_jax.training.config import RELEASE_ROOT, Clip, DataConfig, OptimizerConfig, Schedule
 from poem_jax.training.recipes import experiment

@@ -1,0 +1,58 @@
+"""`poem fit`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
+from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder
+
+if TYPE_CHECKING:
+    from poem_jax.hand.model import HandModel
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit hands to 2D key points from several calibrated cameras; no network, no images needed.
+
+    Writes what `reconstruct` writes, with pose, shape and place of the hand model, and the uncertainty of
+    every joint; see docs/fitting.md.
+    """
+
+    keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
+    """Key points (npz); see docs/captures.md."""
+    out: Folder
+    """Folder for the results; files of the same name are replaced."""
+    rig: OptionalFile = None
+    """Calibration; without it rig.json or calibration/rig.json in the folder of --images or of KEYPOINTS."""
+    images: OptionalFolder = None
+    """Capture folder with the images to draw on."""
+    mano: OptionalFile = None
+    """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
+    smooth: Flag = False
+    """Hold the frames of a take together in a second pass."""
+    debug: Flag = False
+    """Show the full traceback of an error."""
+
+    def run(self) -> None:
+        """Write the results and print where they are."""
+        from poem_jax.capture.fit import fit, read_keypoint_take
+        from poem_jax.io.writable import check_folder_is_writable
+
+        check_folder_is_writable(self.out)
+        take = read_keypoint_take(self.keypoints, self.rig, self.images)
+        hand = hand_from(self.mano)
+        say(f"{len(take.frames)} frames; the first run on a machine compiles the fit, once")
+        with tells_what_is_left(self.out):
+            written = fit(take, self.out, hand=hand, smooth=self.smooth)
+        print_files(written, self.out)
+        print_summary(written.report)
+
+
+def hand_from(path: Path | None) -> "HandModel | None":
+    """Read the user's hand, if one is given."""
+    from poem_jax.hand.mano_file import load
+
+    return None if path is None else load(path)

@@ -1,0 +1,77 @@
+"""What a command says: on standard error what it is doing, on standard output what came of it.
+
+Only warnings, errors and the end by a signal carry the prefix `poem:`.
+"""
+
+import contextlib
+import logging
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from poem_jax.capture.results import Written
+
+
+def say(text: str) -> None:
+    """Tell what the command is doing."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def set_up_logging() -> None:
+    """Show the package's warnings with the prefix `poem:`, and what it is doing without."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Formatter())
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    logging.getLogger("poem_jax").setLevel(logging.INFO)
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return f"poem: {text}" if record.levelno >= logging.WARNING else text
+
+
+@contextlib.contextmanager
+def tells_what_is_left(out: Path) -> Iterator[None]:
+    """When the block is stopped, say whether anything was written to the folder or file `out` so far."""
+    start = time.time()
+    try:
+        yield
+    except KeyboardInterrupt:
+        written = _written_since(out, start)
+        say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
+        raise
+
+
+def _written_since(out: Path, start: float) -> bool:
+    files = [out] if out.is_file() else out.rglob("*")
+    # File systems keep whole milliseconds, or less.
+    return any(file.is_file() and file.stat().st_mtime >= start - 0.01 for file in files)
+
+
+def print_files(written: "Written", out: Path) -> None:
+    """List the files folder by folder; frames beyond the third in one line."""
+    folders: dict[Path, list[str]] = {}
+    for path in written.files:
+        folders.setdefault(path.parent, []).append(path.name)
+    frames = [folder for folder in folders if folder != out]
+    for folder in frames[:3]:
+        print(f"{folder}/  {'  '.join(folders[folder])}")
+    if len(frames) > 3:
+        print(f"... and {len(frames) - 3} more frames like these")
+    print(f"{out}/  {'  '.join(folders.get(out, []))}")
+
+
+def print_summary(report: dict[str, Any]) -> None:
+    """Print how many hands were found, how well they fit, and the time."""
+    reprojection = report["reprojection"]
+    hands = [hand for frame in report["frames"] for hand in frame.get("hands", [])]
+    solved = sum(hand["valid"] for hand in hands)
+    print(f"\n{solved} of {len(hands)} hands in {len(report['frames'])} frames", end="")
+    print(f", {report['failed_frames']} frames failed" if report["failed_frames"] else "")
+    if reprojection["median_px"] is not None:
+        print(f"reprojection error {reprojection['median_px']:.1f} px (median, {reprojection['against']})")
+    print(f"done in {report['timings_s']['total']:.1f} s")

@@ -1,0 +1,70 @@
+"""`poem reconstruct`."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
+from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
+
+if TYPE_CHECKING:
+    from poem_jax.capture.results import Written
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct the hands of a capture: meshes, overlays, a 3D page, arrays and a report.
+
+    DIR holds one image per camera, <camera>.jpg or .png, or frames/<frame>/<camera>.jpg for a take. Boxes or
+    2D key points say where the hands are in each view; see docs/captures.md.
+    """
+
+    folder: PositionalFolder
+    """The capture."""
+    out: Folder
+    """Folder for the results; files of the same name are replaced."""
+    rig: OptionalFile = None
+    """Calibration; without it rig.json or calibration/rig.json in DIR."""
+    boxes: OptionalFile = None
+    """Boxes or key points (npz); without it boxes.npz in DIR."""
+    checkpoint: OptionalFolder = None
+    """Model folder that poem_jax.save wrote; without it the shipped weights."""
+    engine: Literal["network", "fit"] = "network"
+    """fit: no network, the hand model fitted to key points (then --boxes must hold them)."""
+    mano: OptionalFile = None
+    """With --engine fit, as for `poem fit`."""
+    smooth: Flag = False
+    """With --engine fit, as for `poem fit`."""
+    debug: Flag = False
+    """Show the full traceback of an error."""
+
+    def run(self) -> None:
+        """Write the results and print where they are."""
+        from poem_jax.io.writable import check_folder_is_writable
+
+        if self.engine == "fit" and self.checkpoint is not None:
+            raise ValueError("--checkpoint is for --engine network; a fit has no weights")
+        if self.engine == "network" and (self.mano is not None or self.smooth):
+            raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
+        check_folder_is_writable(self.out)
+        with tells_what_is_left(self.out):
+            written = self._fit() if self.engine == "fit" else self._reconstruct()
+        print_files(written, self.out)
+        print_summary(written.report)
+
+    def _reconstruct(self) -> "Written":
+        from poem_jax.capture.pipeline import reconstruct
+        from poem_jax.capture.take import read_take
+
+        take = read_take(self.folder, self.rig, self.boxes)
+        say(f"{len(take.frames)} frames; the first run on a machine compiles the model, once")
+        return reconstruct(take, self.out, checkpoint=self.checkpoint)
+
+    def _fit(self) -> "Written":
+        from poem_jax.capture.fit import fit
+        from poem_jax.capture.take import read_take
+        from poem_jax.cli.fit import hand_from
+
+        take = read_take(self.folder, self.rig, self.boxes)
+        hand = hand_from(self.mano)
+        say(f"{len(take.frames)} frames; the first run on a machine compiles the fit, once")
+        return fit(take, self.out, hand=hand, smooth=self.smooth)

@@ -1,0 +1,71 @@
+"""Experiments: those of the package by name, others by path, and the doors in `configs/`."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from poem_jax import experiments
+from poem_jax.experiments import experiment_names, open_experiment
+from poem_jax.experiments.synthetic_benchmark import benchmark
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = Path(experiments.__file__).parent
+
+
+@pytest.mark.parametrize("name", experiment_names())
+def test_every_experiment_opens_by_name_and_says_what_to_expect(name):
+    config = open_experiment(name)
+    assert config.name == name
+    assert config.train.out == f"runs/{name}"
+    document = importlib.import_module(f"poem_jax.experiments.{name}").__doc__
+    assert document is not None
+    for part in ("What:", "Hardware:", "Time:", "Expected:", f"Command:   poem train {name}\n"):
+        assert part in document
+
+
+@pytest.mark.parametrize("name", [*experiment_names(), "synthetic_benchmark"])
+def test_configs_has_a_door_to_every_experiment(name):
+    door = importlib.util.spec_from_file_location(f"door_{name}", ROOT / "configs" / f"{name}.py")
+    module = importlib.util.module_from_spec(door)
+    door.loader.exec_module(module)
+    variable = "benchmark" if name == "synthetic_benchmark" else "config"
+    there = importlib.import_module(f"poem_jax.experiments.{name}")
+    assert getattr(module, variable) is getattr(there, variable)
+
+
+def test_configs_has_no_door_to_nothing():
+    doors = {path.stem for path in (ROOT / "configs").glob("*.py")}
+    assert doors == {path.stem for path in FOLDER.glob("*.py")} - {"__init__"}
+
+
+def test_an_experiment_opens_by_path(tmp_path):
+    mine = tmp_path / "mine.py"
+    mine.write_text(
+        "from dataclasses import replace\n"
+        "from poem_jax.experiments.tiny_synthetic import config as tiny\n"
+        "config = replace(tiny, name='mine')\n"
+    )
+    assert open_experiment(mine).name == open_experiment(str(mine)).name == "mine"
+    assert open_experiment(ROOT / "configs" / "tiny_synthetic.py") == open_experiment("tiny_synthetic")
+
+
+def test_what_cannot_be_opened_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"no experiment is called 'tinny'; the package has .*tiny_syn"):
+        open_experiment("tinny")
+    with pytest.raises(ValueError, match="no experiment is called 'synthetic_benchmark'"):
+        open_experiment("synthetic_benchmark")
+    with pytest.raises(FileNotFoundError, match=r"experiment file not found: .*absent\.py"):
+        open_experiment(str(tmp_path / "absent.py"))
+    with pytest.raises(FileNotFoundError, match=r"experiment file not found: absent\.py"):
+        open_experiment("absent.py")
+    (tmp_path / "empty.py").write_text("other = 1\n")
+    with pytest.raises(ValueError, match=r"must define `config = TrainConfig.*it defines \['other'\]"):
+        open_experiment(tmp_path / "empty.py")
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(ValueError, match="is not a Python file"):
+        open_experiment(tmp_path / "notes.txt")
+
+
+def test_the_benchmark_is_what_the_shipped_model_learned_from():
+    assert open_experiment("tiny_synthetic").data.synthetic == benchmark
