@@ -14,28 +14,27 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from poem_jax.calibration.epipolar import ideal_keypoints
+from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import align_boxes, frame_key, read_boxes, without_boxes_outside
 from poem_jax.capture.folder import FramePaths, find_frames
 from poem_jax.capture.frame_padding import padded_frames
-from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, judge_pairs
+from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit
 from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
 from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
 from poem_jax.capture.rig_file import find_rig
 from poem_jax.capture.samples import HandResult
 from poem_jax.capture.take import FrameOutcome, HandOutcome, Take, read_frame
-from poem_jax.geometry.distortion import distort_pixels, undistort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.topology import ROOT_JOINT
-from poem_jax.typing import Array, Float
+from poem_jax.typing import Array
 
 if TYPE_CHECKING:
     from poem_jax.fitting import FitConfig, FitResult
 
 NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by two views that agree on them"
-
-_MISSED_PX = 0.5
 
 _log = logging.getLogger(__name__)
 
@@ -132,7 +131,7 @@ def fit(
     hands = hands_of(default_hand() if hand is None else hand)
     keypoints = ideal_keypoints(take.rig, take.hands.keypoints_px)
     check_triangulation(take.rig, keypoints)
-    warnings = judge_pairs(take.rig, keypoints)
+    warnings = [str(finding) for finding in judge_views(take.rig, take.hands.keypoints_px)]
     clock.lap("triangulate_with_compilation")
     config = fit_config(take.rig, smooth)
     results = []
@@ -156,22 +155,6 @@ def fit_config(rig: Rig, smooth: bool) -> "FitConfig":
     from poem_jax.fitting.smooth import SmoothConfig
 
     return FitConfig(noise=KeypointNoise.of_images(rig.size_wh), smooth=SmoothConfig() if smooth else None)
-
-
-def ideal_keypoints(
-    rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]
-) -> Float[Array, "frame hand view 21 2"]:
-    """Return the key points of the undistorted images with the rig's `K`.
-
-    NaN stays NaN; points beyond the fold of a lens, which no ray reaches, become NaN.
-    """
-    by_view = np.moveaxis(np.nan_to_num(keypoints_px), 2, 0)
-    flat = by_view.reshape(rig.num_views, -1, 2)
-    ideal = undistort_pixels(flat, rig.K, rig.dist)
-    missed = np.linalg.norm(distort_pixels(ideal, rig.K, rig.dist) - flat, axis=-1, keepdims=True)
-    ideal = np.where(missed < _MISSED_PX, ideal, np.nan)
-    ideal = np.moveaxis(ideal.reshape(by_view.shape), 0, 2)
-    return np.where(np.isfinite(keypoints_px), ideal, np.nan)
 
 
 def _check_take(take: Take) -> None:

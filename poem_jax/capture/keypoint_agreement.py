@@ -1,13 +1,10 @@
 """Whether the rig of a take and its 2D key points agree, and whether they are those of the hand they claim.
 
-Two views of one point satisfy the epipolar constraint; where the key points of a pair of cameras miss it by
-far in most frames, one of the two is badly calibrated or not in time. That is a warning, for other pairs may
-serve. Triangulated points of an impossible size, or none at all, are an error: nothing right can come of
-them.
+Triangulated points of an impossible size, or none at all, are an error: nothing right can come of them. Views
+that do not fit together are a warning, as others may serve (`calibration.view_agreement`).
 """
 
 import functools
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +12,7 @@ import numpy as np
 from poem_jax.capture.frame_padding import padded_frames
 from poem_jax.geometry.camera_checks import INVERTED
 from poem_jax.geometry.rig import Rig
-from poem_jax.geometry.transforms import invert_rigid, skew_matrix
+from poem_jax.geometry.transforms import invert_rigid
 from poem_jax.geometry.world_origin import distant_origin, move_origin
 from poem_jax.hand.topology import ROOT_JOINT, WRIST
 from poem_jax.typing import Array, Float
@@ -28,10 +25,6 @@ PALM_M = (0.04, 0.16)
 """From the wrist to the middle knuckle, metres: no hand is outside."""
 ADULT_PALM_M = 0.093
 
-_SUSPICIOUS_SHARE = 0.006
-"""Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
-between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
-_LEAST_POINTS = 21
 _LEAST_GAIN = 5.0
 _MOST_FRAMES = 0.75
 """The mirror image must be likelier by e^5 in the median frame, and likelier at all in three of four."""
@@ -39,48 +32,6 @@ _FITS_NOT = 4.0
 _AGREEING = (0.75, 0.9)
 """Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
 their inverses are right."""
-
-
-def epipolar_distances_px(
-    rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]
-) -> Float[Array, "view view"]:
-    """Return the median distance of key points from their epipolar lines for every pair of cameras.
-
-    The first-order geometric distance |x_b^T F x_a| / |(F x_a, F^T x_b)_xy| (Hartley and Zisserman, 11.9),
-    pixels of the undistorted images; NaN on the diagonal and where a pair shares fewer than 21 key points.
-    """
-    distances = np.full((rig.num_views, rig.num_views), np.nan)
-    ones = np.ones((*keypoints_px.shape[:-1], 1))
-    points = np.moveaxis(np.concatenate([keypoints_px, ones], -1), 2, 0).reshape(rig.num_views, -1, 3)
-    for a, b in combinations(range(rig.num_views), 2):
-        T_b_from_a = rig.T_cam_from_world[b] @ invert_rigid(rig.T_cam_from_world[a])
-        essential = skew_matrix(T_b_from_a[:3, 3]) @ T_b_from_a[:3, :3]
-        F = np.linalg.inv(rig.K[b]).T @ essential @ np.linalg.inv(rig.K[a])
-        lines_b, lines_a = points[a] @ F.T, points[b] @ F
-        slope = np.sqrt((lines_a[:, :2] ** 2).sum(-1) + (lines_b[:, :2] ** 2).sum(-1))
-        found = np.abs((lines_b * points[b]).sum(-1)) / np.maximum(slope, 1e-12)
-        found = found[np.isfinite(found)]
-        if len(found) >= _LEAST_POINTS:
-            distances[a, b] = distances[b, a] = np.median(found)
-    return distances
-
-
-def judge_pairs(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> list[str]:
-    """Return a warning that names the cameras whose key points do not fit together, if there are any."""
-    distances = epipolar_distances_px(rig, keypoints_px)
-    limit = _SUSPICIOUS_SHARE * np.linalg.norm(rig.size_wh, axis=-1).mean()
-    pairs = [(a, b) for a, b in combinations(range(rig.num_views), 2) if distances[a, b] > limit]
-    if not pairs:
-        return []
-    named = ", ".join(
-        f"'{rig.names[a]}' and '{rig.names[b]}' {distances[a, b]:.0f} px"
-        for a, b in sorted(pairs, key=lambda pair: -distances[pair])
-    )
-    return [
-        f"the key points of these cameras do not fit together: {named} off each other's epipolar lines "
-        f"(median; expected below {limit:.0f} px). Calibration, or frames that are not of one moment? The "
-        "results are not to be trusted to the millimetre"
-    ]
 
 
 def check_triangulation(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
-from poem_jax.capture.fit import fit, hands_of, ideal_keypoints, read_keypoint_take
+from poem_jax.capture.fit import fit, hands_of, read_keypoint_take
 from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.frame_padding import padded_frames
-from poem_jax.capture.keypoint_agreement import epipolar_distances_px
 from poem_jax.capture.take import Take
 from poem_jax.cli import main
 from poem_jax.geometry.distortion import distort_pixels
@@ -184,15 +184,6 @@ def test_a_right_rig_is_not_complained_about(take, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         fit(take, tmp_path, progress=False)
     assert not caplog.records
-
-
-def test_epipolar_distances_are_the_noise(take):
-    ideal = ideal_keypoints(take.rig, take.hands.keypoints_px)
-    distances = epipolar_distances_px(take.rig, ideal)
-    off_diagonal = ~np.eye(VIEWS, dtype=bool)
-    assert np.isnan(np.diag(distances)).all()
-    # The median of |N(0, 0.5 px)|.
-    np.testing.assert_allclose(distances[off_diagonal], 0.6745 * 0.5, atol=0.1)
 
 
 def test_the_wrong_side_is_noticed(take, tmp_path, caplog):

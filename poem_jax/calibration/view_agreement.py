@@ -1,0 +1,208 @@
+"""Which cameras do not show what the others show, and why: exchanged, mirrored, turned or copied images.
+
+What tells is the distance of key points from each other's epipolar lines. A cause is named where undoing it
+brings all pairs of cameras together and undoing no other does; otherwise the pairs are named that disagree.
+"""
+
+from collections.abc import Callable, Iterator
+from itertools import combinations, permutations
+
+import numpy as np
+
+from poem_jax.calibration.epipolar import (
+    epipolar_distances_px,
+    fundamental_matrix,
+    ideal_keypoints,
+    median_distance,
+)
+from poem_jax.calibration.findings import Finding
+from poem_jax.geometry.rig import Rig
+from poem_jax.typing import Array, Bool, Float
+
+SUSPICIOUS_SHARE = 0.006
+"""Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
+between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
+MAX_ORDERED_VIEWS = 5
+"""Of so many cameras every order is tried; of more, every exchange of two."""
+_MAX_POINTS = 2000
+_COPIED_SHARE = 0.1
+"""Of a hand's extent in the image: key points of two cameras nearer to each other than this are of one
+image."""
+_CLEAR = 2.0
+"""A cause must leave half the distance that any other cause leaves."""
+
+_Flip = Callable[[Array, Array], Array]
+_FLIPS: dict[str, _Flip] = {
+    "mirrored left to right": lambda uv, wh: np.stack([wh[0] - uv[..., 0], uv[..., 1]], -1),
+    "turned by 180 degrees": lambda uv, wh: wh - uv,
+    "mirrored top to bottom": lambda uv, wh: np.stack([uv[..., 0], wh[1] - uv[..., 1]], -1),
+}
+
+
+def judge_views(
+    rig: Rig,
+    keypoints_px: Float[Array, "frame hand view joint 2"],
+    *,
+    extent_share: float = 0.0,
+) -> list[Finding]:
+    """Say which cameras' key points do not fit together, and the cause where it is clear; [] = all is well.
+
+    Args:
+        rig: The cameras.
+        keypoints_px: In pixels of the raw, distorted images; NaN = unseen. Given by a user, or predicted by a
+            network from the images; one joint or 21.
+        extent_share: How far key points may be off as a share of the hand's extent in the images, beyond
+            the noise of a detector; for the predictions of networks.
+
+    Returns: At most one finding, of the name `copied images`, `flipped image`, `cameras exchanged`,
+        `one view disagrees` or `views disagree`.
+    """
+    keypoints_px = _few(np.asarray(keypoints_px, np.float64))
+    ideal = ideal_keypoints(rig, keypoints_px)
+    limit = SUSPICIOUS_SHARE * float(np.linalg.norm(rig.size_wh, axis=-1).mean())
+    limit = max(limit, extent_share * _extent(keypoints_px))
+    distances = epipolar_distances_px(rig, ideal)
+    if not (distances > limit).any():
+        return []
+    copied = _copied(rig, keypoints_px, distances > limit)
+    if copied:
+        return copied
+    fitting = [(cost, finding) for cost, finding in _causes(rig, keypoints_px) if cost <= limit]
+    fitting.sort(key=lambda pair: pair[0])
+    if fitting and (len(fitting) == 1 or fitting[1][0] > _CLEAR * fitting[0][0]):
+        return [fitting[0][1]]
+    return _alone(rig, distances, limit) or [_pairs(rig, distances, limit)]
+
+
+def _causes(rig: Rig, keypoints_px: Array) -> Iterator[tuple[float, Finding]]:
+    """Yield what may be wrong, with the largest median distance of a pair of cameras once it is undone."""
+    table = _distances_by_camera(rig, keypoints_px)
+    for order in _orders(rig.num_views):
+        cost = _worst([table[i, j][order[i], order[j]] for i, j in combinations(range(rig.num_views), 2)])
+        yield cost, _exchanged(rig, order)
+    for view, name in enumerate(rig.names):
+        for flip, turn in _FLIPS.items():
+            undone = keypoints_px.copy()
+            undone[:, :, view] = turn(undone[:, :, view], rig.size_wh[view])
+            evidence = f"the image of camera '{name}' seems to be {flip}: only so it fits the others"
+            finding = Finding("flipped image", evidence, "store it as the camera was calibrated")
+            yield _worst(epipolar_distances_px(rig, ideal_keypoints(rig, undone))), finding
+
+
+def _distances_by_camera(rig: Rig, keypoints_px: Array) -> dict[tuple[int, int], Float[Array, "view view"]]:
+    """Return, for cameras i and j, the distances were they to have taken the images of views a and b."""
+    views = range(rig.num_views)
+    ideal = []
+    for camera in views:
+        lens = rig._replace(K=rig.K[[camera] * rig.num_views], dist=rig.dist[[camera] * rig.num_views])
+        points = np.moveaxis(ideal_keypoints(lens, keypoints_px), 2, 0)
+        ideal.append(points.reshape(rig.num_views, -1, 2))
+    table = {}
+    for i, j in combinations(views, 2):
+        F = fundamental_matrix(rig, i, j)
+        table[i, j] = np.array(
+            [
+                [np.nan if a == b else median_distance(F, ideal[i][a], ideal[j][b]) for b in views]
+                for a in views
+            ]
+        )
+    return table
+
+
+def _orders(num_views: int) -> Iterator[tuple[int, ...]]:
+    """Yield which view's key points a camera may have got, other than its own."""
+    given = tuple(range(num_views))
+    if num_views <= MAX_ORDERED_VIEWS:
+        yield from (order for order in permutations(given) if order != given)
+        return
+    yield given[::-1]
+    for a, b in combinations(given, 2):
+        order = list(given)
+        order[a], order[b] = b, a
+        yield tuple(order)
+
+
+def _exchanged(rig: Rig, order: tuple[int, ...]) -> Finding:
+    moved = [
+        f"'{rig.names[view]}' is of '{rig.names[camera]}'"
+        for camera, view in enumerate(order)
+        if camera != view
+    ]
+    return Finding(
+        "cameras exchanged",
+        f"the cameras seem to be exchanged: what is given as {', '.join(moved)}; only so the views fit",
+        "rename the images or the cameras of the rig, or give the views in the rig's order of cameras "
+        "(`cameras (V,)` in the file of key points or boxes names them)",
+    )
+
+
+def _copied(rig: Rig, keypoints_px: Array, apart: Bool[Array, "view view"]) -> list[Finding]:
+    """Tell views with the same key points, though their cameras stand apart."""
+    by_view = np.moveaxis(keypoints_px, 2, 0)
+    limit = max(2.0, _COPIED_SHARE * _extent(keypoints_px))
+    for a, b in combinations(range(rig.num_views), 2):
+        distance = np.linalg.norm(by_view[a] - by_view[b], axis=-1)
+        if apart[[a, b]].any() and np.isfinite(distance).any() and np.nanmedian(distance) < limit:
+            evidence = (
+                f"cameras '{rig.names[a]}' and '{rig.names[b]}' show the hands at the same pixels "
+                f"({np.nanmedian(distance):.0f} px apart), which cameras at different places do not: "
+                "one image seems to be copied"
+            )
+            return [Finding("copied images", evidence, "give every camera its own image")]
+    return []
+
+
+def _alone(rig: Rig, distances: Array, limit: float) -> list[Finding]:
+    """Name the one view that disagrees, where the others agree with each other."""
+    apart = distances > limit
+    agree = [~np.delete(np.delete(apart, view, 0), view, 1).any() for view in range(rig.num_views)]
+    if rig.num_views < 3 or sum(agree) != 1:
+        return []
+    view = agree.index(True)
+    others = ", ".join(f"'{name}'" for name in rig.names if name != rig.names[view])
+    evidence = (
+        f"the key points of these cameras do not fit together: {_named_pairs(rig, distances, limit)}; "
+        f"without '{rig.names[view]}' the others ({others}) agree, so its image, its place or its "
+        "calibration is wrong, or it is black, covered, or of another moment"
+    )
+    return [Finding("one view disagrees", evidence, f"correct '{rig.names[view]}', or leave it out")]
+
+
+def _pairs(rig: Rig, distances: Array, limit: float) -> Finding:
+    return Finding(
+        "views disagree",
+        f"the key points of these cameras do not fit together: {_named_pairs(rig, distances, limit)}. "
+        "Calibration, order of the cameras, or frames that are not of one moment?",
+        "the results are not to be trusted to the millimetre",
+    )
+
+
+def _named_pairs(rig: Rig, distances: Array, limit: float) -> str:
+    pairs = [pair for pair in combinations(range(rig.num_views), 2) if distances[pair] > limit]
+    named = ", ".join(
+        f"'{rig.names[a]}' and '{rig.names[b]}' {distances[a, b]:.0f} px"
+        for a, b in sorted(pairs, key=lambda pair: -distances[pair])
+    )
+    return f"{named} off each other's epipolar lines (median; expected below {limit:.0f} px)"
+
+
+def _worst(distances: Array | list[float]) -> float:
+    """Return the largest distance; infinity where no pair of cameras can be judged."""
+    finite = np.asarray(distances)[np.isfinite(distances)]
+    return float(finite.max()) if finite.size else np.inf
+
+
+def _extent(keypoints_px: Array) -> float:
+    """Return the median length of the diagonal of a hand's key points in an image; 0 for single joints."""
+    seen = np.isfinite(keypoints_px).all(-1).any(-1)
+    hands = keypoints_px[seen]
+    if not len(hands):
+        return 0.0
+    return float(np.median(np.linalg.norm(np.nanmax(hands, -2) - np.nanmin(hands, -2), axis=-1)))
+
+
+def _few(keypoints_px: Array) -> Array:
+    """Return key points of frames spread over the take, no more than the medians need."""
+    frames, hands, _, joints, _ = keypoints_px.shape
+    kept = max(1, _MAX_POINTS // max(1, hands * joints))
+    return keypoints_px[np.unique(np.linspace(0, frames - 1, min(frames, kept)).astype(int))]
