@@ -28,7 +28,16 @@ _HOME = {
     "preset": "poem_jax.models.poem",
     "save": "poem_jax.weights.store",
 }
-_ROOMS = ("evaluation", "experiments", "fitting", "geometry", "hand", "models", "synthetic")
+_ROOMS = (
+    "calibration",
+    "evaluation",
+    "experiments",
+    "fitting",
+    "geometry",
+    "hand",
+    "models",
+    "synthetic",
+)
 
 __version__ = "0.1.0"
 __all__ = [

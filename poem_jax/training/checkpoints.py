@@ -1,5 +1,6 @@
 """Checkpoints of a run: Orbax, asynchronous and atomic, with the config and the commit beside them."""
 
+import contextlib
 import json
 import logging
 import shutil
@@ -21,6 +22,7 @@ from poem_jax.weights.store import check_leaves, flatten, save, unflatten
 
 _FOLDER = "checkpoints"
 _CHECKSUMS = "seals"
+"""Folder of the checksums, one file a step; the name that the first runs have."""
 _SET_ASIDE = "damaged"
 _CONFIG = "train_config.json"
 _COMMIT = "git_commit.txt"
@@ -59,22 +61,23 @@ class Checkpoints:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            if kind is None and not self._read_only:
-                self.finish()
+            if not self._read_only:
+                # An error on the way leaves the checkpoint before it as good as it is.
+                with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
+                    self.finish()
         finally:
             self._orbax.close()
 
     def finish(self) -> None:
         """Wait for the write in the background, and write the checksums of what it wrote."""
         self._orbax.wait()
-        self.write_checksums_of_what_is_written()
+        self.confirm_write()
 
-    def write_checksums_of_what_is_written(self) -> None:
-        """Write the checksums of the checkpoint that the background has finished, if it has; those of removed
-        steps go.
+    def confirm_write(self) -> None:
+        """Where the write in the background has ended, write the checksums of its files.
 
         Only of what this sitting wrote: a checkpoint without checksums is one whose writing nobody saw to its
-        end.
+        end. Checksums of removed steps go.
         """
         if self._written is None or self._orbax.is_saving_in_progress():
             return
@@ -130,7 +133,7 @@ class Checkpoints:
             raise FileNotFoundError(f"no checkpoint in {self.run_dir / _FOLDER}")
         problems: list[str] = []
         checked = [step for step in self.steps if self._checksums(step).is_file()]
-        unchecked = [step for step in self.steps if step not in sealed]
+        unchecked = [step for step in self.steps if step not in checked]
         for step in checked + unchecked:
             try:
                 state = self._read(step, like)
@@ -140,9 +143,7 @@ class Checkpoints:
             newer = [other for other in self.steps if other > step]
             problems += [self._without_checksums(other) for other in newer if other in unchecked]
             if step in unchecked:
-                problems.append(
-                    f"{self._without_checksums(step)}; it is taken unchecked, for want of one that has them"
-                )
+                problems.append(f"{self._without_checksums(step)}; it is taken unchecked, since none has any")
             for problem in problems:
                 _log.warning("%s", problem)
             self._set_aside(newer)
@@ -166,7 +167,8 @@ class Checkpoints:
         return unflatten(leaves, like)
 
     def _without_checksums(self, step: int) -> str:
-        return f"checkpoint {step} in {self.run_dir / _FOLDER} has no checksums: the run ended while it was written"
+        place = self.run_dir / _FOLDER
+        return f"checkpoint {step} in {place} has no checksums: the run ended while it was written"
 
     def _set_aside(self, steps: list[int]) -> None:
         """Move checkpoints to where nothing takes them for good ones, unless the run is only read."""

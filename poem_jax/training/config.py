@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from poem_jax.losses import PAPER, LossRecipe
-from poem_jax.models.config import Config
+from poem_jax.models.config import Config, require
 from poem_jax.synthetic.config import SyntheticConfig
 
 
@@ -52,10 +52,14 @@ class BatchShape:
     """How often this kind is drawn, relative to the others."""
 
     def __post_init__(self) -> None:
-        if not 1 <= (self.min_views or 1) <= self.num_views:
-            raise ValueError(f"`min_views` must lie in 1..num_views = {self.num_views}; got {self.min_views}")
-        if self.batch_size < 1 or self.weight < 0:
-            raise ValueError(f"`batch_size` must be >= 1 and `weight` >= 0; got {self}")
+        require(
+            1 <= (self.min_views or 1) <= self.num_views,
+            f"`min_views` must lie in 1..num_views = {self.num_views}; got {self.min_views}",
+        )
+        require(
+            self.batch_size >= 1 and self.weight >= 0,
+            f"`batch_size` must be at least 1 and `weight` at least 0; got {self}",
+        )
 
 
 @dataclass(frozen=True)
@@ -72,10 +76,10 @@ class DataConfig:
     """Threads that draw them."""
 
     def __post_init__(self) -> None:
-        if not self.batches or sum(shape.weight for shape in self.batches) <= 0:
-            raise ValueError(
-                f"`data.batches` needs at least one shape with positive weight; got {self.batches}"
-            )
+        require(
+            sum(shape.weight for shape in self.batches) > 0,
+            f"`data.batches` needs at least one shape with positive weight; got {self.batches}",
+        )
 
 
 class RootSource(Enum):
@@ -103,7 +107,7 @@ class TrainingRoot:
 PAPER_ROOT = TrainingRoot()
 """Gaussian noise of 1 cm per sample and coordinate."""
 RELEASE_ROOT = TrainingRoot(per_coordinate_m=0.01, shared_m=0.01, scale=0.01)
-"""The released training code (FACTS section 3)."""
+"""What the released training code does: noise on every joint, one shift and one scale a batch."""
 
 
 @dataclass(frozen=True)
@@ -162,18 +166,20 @@ class RunConfig:
     """Refuse to start while the working tree has uncommitted changes."""
 
     def __post_init__(self) -> None:
-        for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"`train.{name}` must be at least {least}; got {getattr(self, name)}")
-        if self.max_minutes is not None and not self.max_minutes > 0:
-            raise ValueError(f"`train.max_minutes` must be positive, or None; got {self.max_minutes}")
-        if not self.validation_views or min(self.validation_views) < 1:
-            raise ValueError(
-                f"`train.validation_views` must name view counts from 1; got {self.validation_views}"
-            )
+        for name, minimum in _MINIMA.items():
+            value = getattr(self, name)
+            require(value >= minimum, f"`train.{name}` must be at least {minimum}; got {value}")
+        require(
+            self.max_minutes is None or self.max_minutes > 0,
+            f"`train.max_minutes` must be positive, or None; got {self.max_minutes}",
+        )
+        require(
+            min(self.validation_views, default=0) >= 1,
+            f"`train.validation_views` must name view counts from 1; got {self.validation_views}",
+        )
 
 
-_LEAST = {
+_MINIMA = {
     "steps": 0,
     "log_every": 1,
     "checkpoint_every": 1,
@@ -200,27 +206,26 @@ class TrainConfig:
     train: RunConfig = RunConfig()
 
     def __post_init__(self) -> None:
-        devices = self.train.host_devices
-        sizes = [shape.batch_size for shape in self.data.batches]
-        if any(size % devices for size in sizes):
-            raise ValueError(
-                f"every `batch_size` must be a multiple of `train.host_devices` = {devices}; got {sizes}"
-            )
-        data = self.data.synthetic
-        if tuple(data.image_hw) != tuple(self.model.image_hw):
-            raise ValueError(
-                f"`data.synthetic.image_hw` must be the model's {self.model.image_hw}; got {data.image_hw}"
-            )
-        most = max(shape.num_views for shape in self.data.batches)
-        if most > data.num_views:
-            raise ValueError(
-                f"`data.batches` asks for {most} views, but `data.synthetic.num_views` is {data.num_views}"
-            )
-        if self.train.validate_every and max(self.train.validation_views) > data.num_views:
-            raise ValueError(
-                f"`train.validation_views` must not exceed `data.synthetic.num_views` = {data.num_views}; "
-                f"got {self.train.validation_views}"
-            )
+        run, data = self.train, self.data.synthetic
+        devices, sizes = run.host_devices, [shape.batch_size for shape in self.data.batches]
+        require(
+            all(size % devices == 0 for size in sizes),
+            f"every `batch_size` must be a multiple of `train.host_devices` = {devices}; got {sizes}",
+        )
+        require(
+            tuple(data.image_hw) == tuple(self.model.image_hw),
+            f"`data.synthetic.image_hw` must be the model's {self.model.image_hw}; got {data.image_hw}",
+        )
+        max_views = max(shape.num_views for shape in self.data.batches)
+        require(
+            max_views <= data.num_views,
+            f"`data.batches` asks for {max_views} views, but `data.synthetic.num_views` is {data.num_views}",
+        )
+        require(
+            not run.validate_every or max(run.validation_views) <= data.num_views,
+            f"`train.validation_views` must not exceed `data.synthetic.num_views` = {data.num_views}; "
+            f"got {run.validation_views}",
+        )
 
 
 BOOKKEEPING = (

@@ -183,7 +183,7 @@ class _Run:
         if len(self.unread) > 1:
             # The host stays one step ahead of the devices, not more.
             jax.block_until_ready(self.unread[-2][1]["loss"])
-        self.checkpoints.write_checksums_of_what_is_written()
+        self.checkpoints.confirm_write()
         self.journal.advance()
         return state
 

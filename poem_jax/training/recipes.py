@@ -1,7 +1,7 @@
 """Named training recipes: loss, noise of the root, and optimiser that belong together.
 
-`paper` supervises every layer; `release` does what the authors' code does (FACTS section 10): the last layer
-only, every gradient tensor clipped on its own, noise shared by the batch, a tenfold drop of the rate at 70 %.
+`paper` supervises every layer; `release` does what the authors' code does: the last layer only, every
+gradient tensor clipped on its own, noise shared by the batch, a tenfold drop of the rate at 70 %.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class Recipe:
     optimizer: OptimizerConfig
 
 
-PAPER = Recipe(
+PAPER_RECIPE = Recipe(
     "paper",
     losses.PAPER,
     PAPER_ROOT,
@@ -37,7 +37,7 @@ PAPER = Recipe(
         learning_rate=1e-4, schedule=Schedule.COSINE, final_ratio=0.001, clip=Clip.GLOBAL, clip_norm=1.0
     ),
 )
-RELEASE = Recipe(
+RELEASE_RECIPE = Recipe(
     "release",
     losses.RELEASE,
     RELEASE_ROOT,
@@ -45,13 +45,13 @@ RELEASE = Recipe(
         learning_rate=1e-4, schedule=Schedule.STEP, drop_at=0.7, clip=Clip.PER_TENSOR, clip_norm=1.0
     ),
 )
-RELEASE_MANO = replace(
-    RELEASE,
+RELEASE_MANO_RECIPE = replace(
+    RELEASE_RECIPE,
     name="release-mano",
-    optimizer=replace(RELEASE.optimizer, schedule=Schedule.COSINE, final_ratio=0.001),
+    optimizer=replace(RELEASE_RECIPE.optimizer, schedule=Schedule.COSINE, final_ratio=0.001),
 )
 """The released parametric model had a cosine down to 1e-7."""
-RECIPES = {recipe.name: recipe for recipe in (PAPER, RELEASE, RELEASE_MANO)}
+RECIPES = {recipe.name: recipe for recipe in (PAPER_RECIPE, RELEASE_RECIPE, RELEASE_MANO_RECIPE)}
 
 
 def experiment(recipe: str, **rest: Any) -> TrainConfig:

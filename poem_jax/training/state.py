@@ -83,7 +83,7 @@ def _one_schedule(options: OptimizerConfig, peak: float, steps: int) -> optax.Sc
 
 
 def clip_each_tensor(max_norm: float) -> optax.GradientTransformation:
-    """Limit the norm of every gradient tensor on its own, as the release does (FACTS section 10).
+    """Limit the norm of every gradient tensor on its own, as the released training code does.
 
     Equal blocks whose weights are stacked in one array count as so many tensors.
     """

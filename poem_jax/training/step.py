@@ -25,7 +25,7 @@ from poem_jax.typing import Array, Float, Params, PRNGKeyArray
 
 Metrics = dict[str, Array]
 
-FARTHEST_ROOT_M = 0.1
+MAX_ROOT_ERROR_M = 0.1
 """The radius of the ball of basis points."""
 
 
@@ -120,8 +120,8 @@ def noisy_root(
 ) -> Float[Array, "batch 3"]:
     """Disturb the true root joint, as the second stage must live with the first stage's errors.
 
-    The release adds noise to all joints and scales them about the noisy wrist (FACTS section 3), then uses
-    the root only. Numbers belong to a sample's global index, so that splitting the batch changes none.
+    The released code adds noise to all joints and scales them about the noisy wrist, then uses the root
+    only. Numbers belong to a sample's global index, so that splitting the batch changes none.
     """
     batch_size = joints_world.shape[0]
     first = 0 if axis_name is None else jax.lax.axis_index(axis_name) * batch_size
@@ -140,7 +140,7 @@ def near_the_hand(prediction: Prediction, batch: MultiViewBatch) -> Prediction:
     Their second stage sees nothing of the hand and could only learn the mean.
     """
     root = batch.joints_world[:, ROOT_JOINT]
-    near = _distance(prediction.root_world, root) < FARTHEST_ROOT_M
+    near = _distance(prediction.root_world, root) < MAX_ROOT_ERROR_M
     return prediction._replace(valid=prediction.valid & near)
 
 
