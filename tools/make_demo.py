@@ -14,7 +14,6 @@ import numpy as np
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.demo import GROUND_TRUTH, demo_folder
-from poem_jax.capture.outputs import write_arrays
 from poem_jax.data.transforms import box_from_center
 from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.geometry.cameras import crop_homography, crop_intrinsics, invert_intrinsics, project
@@ -82,7 +81,7 @@ def write_demo(out: Path) -> None:
     keypoints_px, _ = project(K, T, np.broadcast_to(joints, (NUM_VIEWS, *joints.shape)))
     write_boxes(out / "boxes.npz", HandBoxes(boxes_from_keypoints(keypoints_px)[None, None], ("right",)))
     truth = {"vertices_world": scene.body.vertices_world[None], "joints_world": scene.body.joints_world[None]}
-    write_arrays(out / GROUND_TRUTH, truth)
+    np.savez_compressed(out / GROUND_TRUTH, **truth)
 
 
 if __name__ == "__main__":

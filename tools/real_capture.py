@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from poem_jax.capture.outputs import write_arrays, write_json
 from poem_jax.capture.pipeline import reconstruct
 from poem_jax.capture.take import read_take
 from poem_jax.geometry.alignment import apply_similarity, procrustes
@@ -66,18 +65,20 @@ def main() -> None:
     arguments = parser.parse_args()
     keypoints, joints, frames = read_pseudo_truth(arguments.folder / "pseudo_gt.npz")
     boxes = arguments.out / "keypoints.npz"
-    write_arrays(boxes, {"keypoints_px": keypoints, "hand_side": np.array(SIDES), "frames": np.array(frames)})
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    np.savez(boxes, keypoints_px=keypoints, hand_side=SIDES, frames=frames)
     written = reconstruct(
         read_take(arguments.folder, boxes=boxes), arguments.out, checkpoint=arguments.checkpoint
     )
-    table = {}
+    arrays, table = written.arrays, {}
     for hand, side in [*enumerate(SIDES), (slice(None), "both")]:
-        both = written.arrays["joints_world"][:, hand].reshape(-1, 21, 3), joints[:, hand].reshape(-1, 21, 3)
+        both = arrays["joints_world"][:, hand].reshape(-1, 21, 3), joints[:, hand].reshape(-1, 21, 3)
         known = np.isfinite(both[0]).all((-1, -2)) & np.isfinite(both[1]).all((-1, -2))
         table[side] = distances_mm(both[0][known].astype(np.float64), both[1][known])
     table["reprojection"] = written.report["reprojection"]
-    write_json(arguments.out / "distances.json", table)
-    print(json.dumps(table, indent=1))
+    text = json.dumps(table, indent=1)
+    (arguments.out / "distances.json").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

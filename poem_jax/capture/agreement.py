@@ -6,23 +6,21 @@ them: into the squares about the boxes, before these are widened for the crops. 
 meet, the take is refused; where a few do not, these hands are left out, with the reason.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from poem_jax.capture.crops import EXPAND_RATIO, crop_cameras
-from poem_jax.capture.take import Take
+from poem_jax.capture.crop import hand_squares
+from poem_jax.capture.frame import Frame, HandResult, in_groups
 from poem_jax.geometry.camera_checks import INVERTED, check_cameras, check_distances, views_meet
-from poem_jax.geometry.cameras import Cameras
+from poem_jax.geometry.cameras import Cameras, crop_intrinsics
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid
-from poem_jax.typing import Array, Bool
+from poem_jax.typing import Array, Bool, Float
 
-Reasons = list[tuple[str | None, ...]]
-"""Per frame, why a hand cannot be reconstructed; None where nothing is known against it."""
-
-_MARGIN = (1 / EXPAND_RATIO - 1) / 2
-"""From the edges of a crop to those of the square about the box."""
+_SQUARE_HW = (1, 1)
+_WINDOW = 256
+"""Frames that are judged together; their images are not read yet."""
 _SUSPICIOUS_SHARE = 0.25
 _CERTAIN_SHARE = 0.9
 _CHUNK = 256
@@ -32,34 +30,56 @@ _WHAT_TO_CHECK = (
 )
 
 
-def judge_take(take: Take, crop_hw: tuple[int, int]) -> Reasons:
-    """Return which hands have boxes that do not fit together, and with which cameras.
+def judge_boxes(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
+    """Find the square about each hand, and mark the hands whose boxes do not fit together.
 
     Args:
-        take: A take; its images are not read.
-        crop_hw: Size of the model's crops.
+        frames: A stream, without images so far.
+        rig: The cameras.
+
+    Returns: the stream, with `squares_px`, and `hands` that hold a reason where there is one.
 
     Raises:
         ValueError: A camera is wrong by itself, the cameras are too far apart, or most hands' views do not
-            meet. The message says what, expected, got and fix.
+            meet in the first frames. The message says what, expected, got and fix.
     """
-    check_each_camera(take.rig)
-    cams = crop_cameras(take.hands, take.rig, crop_hw)
+    check_each_camera(rig)
+    for index, group in enumerate(in_groups(frames, _WINDOW)):
+        squares = np.stack([hand_squares(frame, rig) for frame in group])
+        reasons = iter(_reasons_against(squares.reshape(-1, rig.num_views, 4), rig, refuse=index == 0))
+        unused = np.zeros(rig.num_views, bool)
+        for frame, squares_px in zip(group, squares, strict=True):
+            hands = tuple(HandResult(unused, next(reasons)) for _ in squares_px)
+            yield frame._replace(squares_px=squares_px, hands=hands)
+
+
+def _reasons_against(
+    squares_px: Float[Array, "sample view 4"], rig: Rig, *, refuse: bool
+) -> list[str | None]:
+    """Return why a hand cannot be reconstructed, for every sample; None where nothing is known against it."""
+    cams = _square_cameras(squares_px, rig)
     check_distances(cams)
     several = cams.view_mask.sum(-1) > 1
-    lost = several & ~_meet(cams, crop_hw)
-    without = _met_without(cams, lost, crop_hw)
-    if lost.sum() > _SUSPICIOUS_SHARE * several.sum():
-        _check_direction(cams, several & ~lost, crop_hw)
-    if 2 * lost.sum() > several.sum():
+    lost = several & ~_meet(cams)
+    without = _met_without(cams, lost)
+    if refuse and lost.sum() > _SUSPICIOUS_SHARE * several.sum():
+        _check_direction(cams, several & ~lost)
+    if refuse and 2 * lost.sum() > several.sum():
         raise ValueError(
             f"the rig does not fit the boxes: for {lost.sum()} of {several.sum()} hands expected a point "
             "that projects into the boxes of all views, got none"
-            f"{_suspects(take, without[lost].mean(0) > 0.5)}; {_WHAT_TO_CHECK}"
+            f"{_suspects(rig, without[lost].mean(0) > 0.5)}; {_WHAT_TO_CHECK}"
         )
-    reasons = [_reason(take, without[i]) if lost[i] else None for i in range(len(lost))]
-    num_hands = len(take.hands.hand_side)
-    return [tuple(reasons[start : start + num_hands]) for start in range(0, len(reasons), num_hands)]
+    return [_reason(rig, without[i]) if lost[i] else None for i in range(len(lost))]
+
+
+def _square_cameras(squares_px: Float[Array, "sample view 4"], rig: Rig) -> Cameras:
+    """Return cameras whose images are the squares, one pixel wide; views that see no hand are masked."""
+    mask = np.isfinite(squares_px).all(-1)
+    K = np.tile(np.eye(3), (*mask.shape, 1, 1))
+    for sample, view in np.argwhere(mask):
+        K[sample, view] = crop_intrinsics(rig.K[view], squares_px[sample, view], _SQUARE_HW)
+    return Cameras(K, np.broadcast_to(rig.T_cam_from_world, (*mask.shape, 4, 4)), mask)
 
 
 def check_each_camera(rig: Rig) -> None:
@@ -72,36 +92,34 @@ def check_each_camera(rig: Rig) -> None:
             raise ValueError(f"camera '{name}' of the rig: {error}") from error
 
 
-def _check_direction(cams: Cameras, met: Bool[Array, " sample"], crop_hw: tuple[int, int]) -> None:
+def _check_direction(cams: Cameras, met: Bool[Array, " sample"]) -> None:
     inverse = cams._replace(T_cam_from_world=invert_rigid(cams.T_cam_from_world))
     several = cams.view_mask.sum(-1) > 1
-    meets = (several & _meet(inverse, crop_hw)).sum()
+    meets = (several & _meet(inverse)).sum()
     if meets > max(met.sum(), _CERTAIN_SHARE * several.sum()):
         raise ValueError(INVERTED)
 
 
-def _met_without(
-    cams: Cameras, lost: Bool[Array, " sample"], crop_hw: tuple[int, int]
-) -> Bool[Array, "sample view"]:
+def _met_without(cams: Cameras, lost: Bool[Array, " sample"]) -> Bool[Array, "sample view"]:
     """Tell which views of the lost hands stand alone: without them the others, two at least, meet."""
     found = np.zeros(cams.view_mask.shape, bool)
     for view in range(cams.view_mask.shape[-1]):
         others = cams.view_mask[lost] & (np.arange(cams.view_mask.shape[-1]) != view)
         rest = Cameras(cams.K[lost], cams.T_cam_from_world[lost], others)
-        found[lost, view] = cams.view_mask[lost, view] & (others.sum(-1) > 1) & _meet(rest, crop_hw)
+        found[lost, view] = cams.view_mask[lost, view] & (others.sum(-1) > 1) & _meet(rest)
     return found
 
 
-def _meet(cams: Cameras, crop_hw: tuple[int, int]) -> Bool[Array, " sample"]:
+def _meet(cams: Cameras) -> Bool[Array, " sample"]:
     starts = range(0, len(cams.K), _CHUNK)
     parts = [Cameras(*(array[start : start + _CHUNK] for array in cams)) for start in starts]
-    return np.concatenate([views_meet(part, crop_hw, _MARGIN) for part in parts] or [np.zeros(0, bool)])
+    return np.concatenate([views_meet(part, _SQUARE_HW, 0.0) for part in parts] or [np.zeros(0, bool)])
 
 
-def _reason(take: Take, without: Bool[Array, " view"]) -> str:
-    return f"no point projects into the boxes of all views{_suspects(take, without)}: box or calibration?"
+def _reason(rig: Rig, without: Bool[Array, " view"]) -> str:
+    return f"no point projects into the boxes of all views{_suspects(rig, without)}: box or calibration?"
 
 
-def _suspects(take: Take, views: Sequence[bool] | Array) -> str:
-    names = [repr(name) for name, suspected in zip(take.rig.names, views, strict=True) if suspected]
+def _suspects(rig: Rig, views: Sequence[bool] | Array) -> str:
+    names = [repr(name) for name, suspected in zip(rig.names, views, strict=True) if suspected]
     return f"; without camera {' or '.join(names)} there is one" if names else ""

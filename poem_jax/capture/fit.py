@@ -1,31 +1,24 @@
-"""From 2D key points and a rig to hand meshes: the whole of `poem fit`, which needs no network and no images.
+"""The stage `predict` by a fit: 2D key points in, hands out; it needs no network and no images.
 
-Every hand is fitted to all of its frames at once (`poem_jax.fitting.take`), so that its shape is one. What
-is wrong with the whole take - camera matrices, unit, side, order of the joints - is said once, before
-anything is written; a frame in which a hand cannot be fitted is marked, and stops nothing.
+A hand is fitted to `FRAMES_TOGETHER` frames at a time (`poem_jax.fitting.take`). Its shape is one for the
+whole take: that of the first frames that show enough of it. What is wrong with the whole take - camera
+matrices, unit, side, order of the joints - is said with the first frames, before anything is written; a frame
+in which a hand cannot be fitted is marked, and stops nothing.
 """
 
-import logging
-import os
-from collections.abc import Iterator
-from pathlib import Path
+import dataclasses
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
-from poem_jax.capture.boxes_file import align_boxes, frame_key, read_boxes, without_boxes_outside
-from poem_jax.capture.folder import FramePaths, find_frames
-from poem_jax.capture.frame_padding import padded_frames
+from poem_jax.capture.frame import Frame, HandResult
+from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit
-from poem_jax.capture.reprojection import given_evidence, joints_shown, reprojection_error
-from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
-from poem_jax.capture.rig_file import find_rig
-from poem_jax.capture.samples import HandResult
-from poem_jax.capture.take import FrameOutcome, HandOutcome, Take, read_frame
+from poem_jax.capture.take import Take
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.topology import ROOT_JOINT
@@ -36,7 +29,10 @@ if TYPE_CHECKING:
 
 NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by two views that agree on them"
 
-_log = logging.getLogger(__name__)
+_CONTEXT = 16
+"""Frames before and after that a smoothed frame is held to; what lies farther does not move it."""
+_FRAMES_FOR_SHAPE = 16
+"""A hand's shape is settled by the first group that shows it in so many frames."""
 
 
 class Hands(NamedTuple):
@@ -60,93 +56,45 @@ def hands_of(model: HandModel) -> Hands:
     return Hands(reflected, model) if model.side == "left" else Hands(model, reflected)
 
 
-def read_keypoint_take(
-    keypoints: str | os.PathLike,
-    rig: str | os.PathLike | None = None,
-    images: str | os.PathLike | None = None,
-) -> Take:
-    """Read key points and rig; the frames are those of the key-point file.
+def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool = False) -> Iterator[Frame]:
+    """Fit the hands of a stream to their key points.
 
     Args:
-        keypoints: File of key points.
-        rig: Rig file; None = `rig.json` or `calibration/rig.json` in the folder `images` where that is given,
-            else beside the key points.
-        images: Capture folder to draw on; its frames are found by name. None = no images.
-
-    Raises:
-        FileNotFoundError: A file, or every image, is missing.
-        ValueError: One of them is wrong, they have different numbers of views, or no name of a frame fits.
-    """
-    found = find_rig(Path(keypoints).parent if images is None else images, rig)
-    hands = read_boxes(keypoints)
-    if hands.keypoints_px is None:
-        raise ValueError(
-            f"{keypoints} holds boxes only; a fit needs `keypoints_px (F, H, V, 21, 2)`, OpenPose order"
-        )
-    pictures = [] if images is None else find_frames(images, found.names)
-    by_key = {frame_key(frame.name): frame for frame in pictures}
-    names = hands.frames or _frame_names(len(hands.boxes_px), pictures)
-    hands = align_boxes(hands, names, found.names, keypoints)
-    nothing = (None,) * found.num_views
-    frames = [by_key.get(frame_key(name), FramePaths(name, nothing)) for name in names]
-    if len(pictures) == len(names) == 1:
-        frames = pictures
-    if pictures and not any(frame in pictures for frame in frames):
-        raise ValueError(
-            f"{images}: no frame of it ({', '.join(frame.name for frame in pictures[:3])}) is among those of "
-            f"{keypoints} ({', '.join(names[:3])})"
-        )
-    return Take(found, frames, without_boxes_outside(hands, found.size_wh))
-
-
-def fit(
-    take: Take,
-    out: str | os.PathLike,
-    *,
-    hand: HandModel | None = None,
-    smooth: bool = False,
-    progress: bool = True,
-) -> Written:
-    """Fit every hand of a take to its key points, and write what `reconstruct` writes, under `out`.
-
-    Beyond that `prediction.npz` holds `joint_sigma_m (F,H,21)`, the standard deviation of one coordinate of
-    every joint, and `pose`, `shape` and `translation` of the hand model.
-
-    Args:
-        take: From `read_keypoint_take`, or from `read_take` where the boxes come with key points.
-        out: Folder for the results.
-        hand: The user's hand in MANO's schema, of either side; None = the shipped hand.
+        frames: With key points.
+        take: Its cameras and the sides of its hands.
+        hands: The hand models.
         smooth: Add a second pass that holds each hand's frames together.
-        progress: Show a progress bar when there are several frames.
+
+    Returns: the stream with its hands, a warning at the frame where it was noticed.
 
     Raises:
-        FileNotFoundError, ValueError: No key points; fewer than two views; the rig does not fit the key
-            points, or its unit is wrong; no hand can be fitted; `out` is a file.
+        ValueError: No key points; fewer than two views; the rig does not fit the first key points, or its
+            unit is wrong.
     """
-    from poem_jax.hand.template import default_hand
-
-    clock = Clock()
-    out = results_folder(out)
-    _check_take(take)
-    hands = hands_of(default_hand() if hand is None else hand)
-    keypoints = ideal_keypoints(take.rig, take.hands.keypoints_px)
-    check_triangulation(take.rig, keypoints)
-    warnings = [str(finding) for finding in judge_views(take.rig, take.hands.keypoints_px)]
-    clock.lap("triangulate_with_compilation")
+    if take.rig.num_views < 2:
+        raise ValueError(f"a fit needs at least two views; the rig has {take.rig.num_views}")
+    check_each_camera(take.rig)
     config = fit_config(take.rig, smooth)
-    results = []
-    for index in range(len(take.hand_names)):
-        fitted, said = _fit_hand(take, keypoints, hands, index, config)
-        results.append(fitted)
-        warnings += said
-    for warning in warnings:
-        _log.warning("%s", warning)
-    clock.lap("fit_with_compilation")
-    frames = _stream(take, results, progress)
-    faces = {"right": hands.right.faces, "left": hands.left.faces}
-    kind = "shipped hand" if hand is None else "given"
-    about = {"engine": "fit", "hand": kind, "smooth": smooth, "warnings": warnings}
-    return write_results(take, out, frames, faces, clock, about)
+    fits = [
+        _HandFit(name, hands.of(side), hands.other(side), config)
+        for name, side in zip(take.hand_names, take.hand_sides, strict=True)
+    ]
+    checked = said = False
+    for group, turns in _windows(frames, _CONTEXT if smooth else 0):
+        raw, confidence = _observed(group)
+        keypoints = ideal_keypoints(take.rig, raw)
+        if not checked:
+            check_triangulation(take.rig, keypoints)
+        warnings = [] if said else [str(finding) for finding in judge_views(take.rig, raw)]
+        checked, said = True, said or bool(warnings)
+        fitted = []
+        for index, hand in enumerate(fits):
+            fitted.append(hand.fit(keypoints[:, index], confidence[:, index], take.rig))
+            warnings += hand.take_warnings()
+        for turn in turns:
+            results = tuple(_result(result, turn) for result in fitted)
+            yield group[turn]._replace(hands=results, warnings=(*group[turn].warnings, *warnings))
+            warnings = []
 
 
 def fit_config(rig: Rig, smooth: bool) -> "FitConfig":
@@ -157,77 +105,91 @@ def fit_config(rig: Rig, smooth: bool) -> "FitConfig":
     return FitConfig(noise=KeypointNoise.of_images(rig.size_wh), smooth=SmoothConfig() if smooth else None)
 
 
-def _check_take(take: Take) -> None:
-    if take.hands.keypoints_px is None:
+def _windows(frames: Iterable[Frame], context: int) -> Iterator[tuple[list[Frame], range]]:
+    """Cut a stream into lists of `FRAMES_TOGETHER` that share `context` frames on either side.
+
+    Yields: a list, and the places in it whose turn it is; each frame has its turn once, in order.
+    """
+    window: list[Frame] = []
+    done = 0
+    for frame in frames:
+        window.append(frame)
+        if len(window) == FRAMES_TOGETHER:
+            yield window, range(done, FRAMES_TOGETHER - context)
+            window, done = window[FRAMES_TOGETHER - 2 * context :], context
+    if done < len(window):
+        yield window, range(done, len(window))
+
+
+def _observed(group: list[Frame]) -> tuple[Array, Array]:
+    """Return the key points of a group as given (frame, hand, view, 21, 2), and their confidence."""
+    if any(frame.keypoints_px is None for frame in group):
         raise ValueError(
             "a fit needs 2D key points; this capture has boxes only: give `keypoints_px`, or use the network"
         )
-    if take.rig.num_views < 2:
-        raise ValueError(f"a fit needs at least two views; the rig has {take.rig.num_views}")
-    check_each_camera(take.rig)
+    keypoints = np.stack([frame.keypoints_px for frame in group])
+    even = np.ones(keypoints.shape[1:-1])
+    return keypoints, np.stack([even if f.confidence is None else f.confidence for f in group])
 
 
-def _fit_hand(
-    take: Take, keypoints: Array, hands: Hands, index: int, config: "FitConfig"
-) -> tuple["FitResult", list[str]]:
-    """Fit one hand, and as a check one of the other side; return the first, and what is to be said."""
-    side = take.hands.hand_side[index]
-    confidence = take.hands.confidence
-    confidence = np.ones(keypoints[:, index].shape[:-1]) if confidence is None else confidence[:, index]
-    evidence = (keypoints[:, index], confidence, take.rig, config)
-    own = _run(hands.of(side), *evidence)
-    other = _run(hands.other(side), *evidence)
-    return own, judge_fit(take.hand_names[index], own, other, config.noise)
+class _HandFit:
+    """One hand through the take, and as a check one of the other side."""
+
+    def __init__(self, name: str, own: HandModel, other: HandModel, config: "FitConfig") -> None:
+        self._name, self._models, self._config = name, (own, other), config
+        self._shapes: tuple[Array | None, Array | None] = (None, None)
+        self._judged = self._said = False
+        self._warnings: list[str] = []
+
+    def fit(self, keypoints: Array, confidence: Array, rig: Rig) -> "FitResult":
+        """Fit a group of frames: key points (frame, view, 21, 2) and their confidence."""
+        own, other = (
+            _run(model, keypoints, confidence, rig, self._config, shape)
+            for model, shape in zip(self._models, self._shapes, strict=True)
+        )
+        enough = own.valid.sum() >= _FRAMES_FOR_SHAPE
+        if own.valid.any() and not self._said and (enough or not self._judged):
+            self._warnings = judge_fit(self._name, own, other, self._config.noise)
+            self._judged, self._said = True, bool(self._warnings)
+        if enough and self._shapes[0] is None:
+            self._shapes = own.shape[0], other.shape[0]
+        return own
+
+    def take_warnings(self) -> list[str]:
+        """Return what the last group gave cause to say, once."""
+        warnings, self._warnings = self._warnings, []
+        return warnings
 
 
-def _run(hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig") -> "FitResult":
+def _run(
+    hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig", shape: Array | None
+) -> "FitResult":
+    """Fit a group of frames, padded to the one size for which there is a program; None = unknown shape."""
     import jax
 
     from poem_jax.fitting import Observations, fit_take, keypoint_model
+    from poem_jax.fitting.lm import ShapeMode
 
-    frames = len(keypoints)
+    if shape is not None:
+        lm = dataclasses.replace(config.lm, shape_mode=ShapeMode.GIVEN)
+        config = dataclasses.replace(config, lm=lm)
     padded = (padded_frames(keypoints), padded_frames(confidence))
     observations = Observations(*padded, rig.K, rig.T_cam_from_world)
-    fitted = jax.device_get(fit_take(keypoint_model(hand), observations, config=config))
-    return jax.tree.map(lambda array: array[:frames], fitted)
+    fitted = jax.device_get(fit_take(keypoint_model(hand), observations, shape, config))
+    return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
 
 
-def _stream(take: Take, results: list["FitResult"], progress: bool) -> Iterator[FrameResults]:
-    several = len(take.frames) > 1
-    for frame in tqdm(range(len(take.frames)), unit="frame", disable=not (progress and several)):
-        found = read_frame(take, frame, images_needed=False)
-        for problem in found.problems:
-            _log.warning("frame %s: an image is left out: %s", take.frames[frame].name, problem.error)
-        outcomes = tuple(_outcome(take, frame, index, result) for index, result in enumerate(results))
-        yield FrameResults(found.images, FrameOutcome(outcomes, found.problems))
-
-
-def _outcome(take: Take, frame: int, index: int, fitted: "FitResult") -> HandOutcome:
-    used = fitted.inlier_mask[frame].any(-1)
-    if not fitted.valid[frame]:
-        nothing = np.full(take.rig.num_views, np.nan)
-        name = take.frames[frame].name
-        _log.warning("frame %s: hand '%s' is left out: %s", name, take.hand_names[index], NOT_FITTED)
-        return HandOutcome(None, used, nothing, nothing, NOT_FITTED)
-    joints = fitted.joints[frame]
-    result = HandResult(
-        valid=True,
-        vertices_world=fitted.vertices[frame],
-        joints_world=joints,
-        root_world=joints[ROOT_JOINT],
-        pose=fitted.pose[frame],
-        shape=fitted.shape[frame],
-        translation=fitted.translation[frame],
-        joint_sigma_m=fitted.sigma_m[frame],
+def _result(fitted: "FitResult", turn: int) -> HandResult:
+    used = fitted.inlier_mask[turn].any(-1)
+    if not fitted.valid[turn]:
+        return HandResult(used, NOT_FITTED)
+    return HandResult(
+        used,
+        vertices_world=fitted.vertices[turn],
+        joints_world=fitted.joints[turn],
+        root_world=fitted.joints[turn, ROOT_JOINT],
+        pose=fitted.pose[turn],
+        shape=fitted.shape[turn],
+        translation=fitted.translation[turn],
+        joint_sigma_m=fitted.sigma_m[turn],
     )
-    evidence = given_evidence(take.hands, frame, index)
-    seen = np.isfinite(evidence.points_px).all(-1).any(-1)
-    errors = reprojection_error(joints, evidence, seen, take.rig)
-    return HandOutcome(result, used, errors, joints_shown(joints, used, take.rig))
-
-
-def _frame_names(count: int, pictures: list[FramePaths]) -> tuple[str, ...]:
-    """Name frames that the file does not: as those of the images where these are as many, else by number."""
-    if len(pictures) == count:
-        return tuple(frame.name for frame in pictures)
-    return tuple(f"{index:04d}" for index in range(count))

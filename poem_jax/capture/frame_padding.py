@@ -1,15 +1,14 @@
-"""Takes of similar length share compiled programs: they are padded with frames in which nothing is seen."""
+"""Groups of frames of one size, so that takes of any length share compiled programs."""
 
 import numpy as np
 
 from poem_jax.typing import Array, Float
 
-_FRAMES_TOGETHER = 128
+FRAMES_TOGETHER = 64
+"""Frames that are fitted at a time: enough to know a hand's shape, few enough to see results soon."""
 
 
 def padded_frames(array: Float[Array, "frame *rest"]) -> Float[Array, "more *rest"]:
-    """Add frames of NaN up to the next power of two, beyond 128 frames to the next multiple of 128."""
-    frames = len(array)
-    many = -(-frames // _FRAMES_TOGETHER) * _FRAMES_TOGETHER
-    padded = many if frames > _FRAMES_TOGETHER else 2 ** int(np.ceil(np.log2(frames)))
-    return np.concatenate([array, np.full((padded - frames, *array.shape[1:]), np.nan)])
+    """Add frames of NaN, in which nothing is seen, up to the next multiple of `FRAMES_TOGETHER`."""
+    missing = -len(array) % FRAMES_TOGETHER
+    return np.concatenate([array, np.full((missing, *array.shape[1:]), np.nan)])

@@ -1,30 +1,35 @@
-"""From a folder of calibrated images to hand meshes: the whole of `poem reconstruct`.
+"""From a capture to hand meshes, as one line: read -> crop -> predict -> judge -> write.
 
-Frames stream through in groups that fill one batch of the model, so that memory does not grow with the take
-and one program serves all of it. The rig is judged once, before any image is read, and refused if it is
-wrong. An image that cannot be read, or a hand whose boxes do not fit together, does not stop a take: the
-report says why.
+Every stage is a function over a stream of frames (`frame.Frame`): it pulls one frame after the other from
+the stage before it, fills in its own fields, and hands it on; the last stage writes. No stage looks back, how
+many frames there are need not be known, and memory does not grow with them.
 """
 
-import logging
+import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
-from poem_jax.capture.agreement import Reasons, judge_take
-from poem_jax.capture.engine import Engine, load_engine, reconstruct_samples
-from poem_jax.capture.outcome import hand_outcome
-from poem_jax.capture.results import Clock, FrameResults, Written, results_folder, write_results
-from poem_jax.capture.samples import HandResult, HandSample, empty_sample, make_sample
-from poem_jax.capture.take import FrameImages, FrameOutcome, Take, read_frame
-from poem_jax.typing import Array
+from poem_jax.capture.agreement import judge_boxes
+from poem_jax.capture.crop import crop_hands
+from poem_jax.capture.fit import Hands, fit_hands, hands_of
+from poem_jax.capture.frame import Frame
+from poem_jax.capture.judge import judge_hands
+from poem_jax.capture.network import Network, load_network, predict_hands
+from poem_jax.capture.read import read_images
+from poem_jax.capture.report import Clock
+from poem_jax.capture.take import Take
+from poem_jax.capture.write import Style, Written, write_results
+from poem_jax.geometry.world_origin import distant_origin, move_origin
+from poem_jax.hand.model import HandModel
+from poem_jax.io.writable import check_folder_is_writable
+from poem_jax.typing import Array, Int
 
-MAX_BATCH = 4
-"""Hands at a time: enough to keep two cores busy, little enough to wait for."""
-
-_log = logging.getLogger(__name__)
+Engine = Callable[[Iterable[Frame], Take, Clock], Iterator[Frame]]
+"""What finds the hands: a stream of frames in, the stream with images and results out."""
 
 
 def reconstruct(
@@ -32,100 +37,108 @@ def reconstruct(
     out: str | os.PathLike,
     *,
     checkpoint: str | os.PathLike | None = None,
-    engine: Engine | None = None,
+    network: Network | None = None,
+    meshes: bool | None = None,
     progress: bool = True,
 ) -> Written:
-    """Reconstruct every hand of every frame, and write meshes, overlays, arrays, report and page under `out`.
+    """Reconstruct every hand of every frame by a network, and write what comes of it under `out`.
 
     Args:
         take: From `read_take`.
-        out: Folder for the results, `out/<frame>/...`; made when missing, files of the same name replaced.
-        checkpoint: Model folder; None = the shipped weights. Not read when an engine is given.
-        engine: A model in memory.
+        out: Folder for the results; made when missing, files of the same name replaced.
+        checkpoint: Model folder; None = the shipped weights. Not read when a network is given.
+        network: A model in memory.
+        meshes: Write the meshes of every frame; None = if there is only one.
         progress: Show a progress bar when there are several frames.
 
     Raises:
         FileNotFoundError, ValueError: The checkpoint, the rig, an image of the only frame, or all frames
-            cannot be used; no hand is seen by two views; `out` is a file.
+            cannot be used; no hand is seen by two views; nothing can be written to `out`.
+        KeyboardInterrupt: Ctrl-C, after what was done has been written.
     """
+    check_folder_is_writable(out)
     clock = Clock()
-    out = results_folder(out)
-    engine = load_engine(checkpoint, batch_size(take)) if engine is None else engine
+    network = load_network(checkpoint) if network is None else network
     clock.lap("load_model")
-    reasons = judge_take(take, engine.config.image_hw)
-    frames = _stream(take, engine, reasons, clock, progress)
-    about = {"engine": "network", "weights": engine.origin, "image_hw": list(engine.config.image_hw)}
-    return write_results(take, out, frames, faces_by_side(engine), clock, about)
+    engine = functools.partial(by_network, network=network)
+    about = {"engine": "network", "weights": network.origin, "image_hw": network.config.image_hw}
+    return _run(take, Path(out), engine, network.faces(), clock, about, meshes, progress)
 
 
-def batch_size(take: Take) -> int:
-    """Return how many hands the model takes at a time: whole frames, at most `MAX_BATCH` where one fits."""
-    num_hands = len(take.hands.hand_side)
-    return num_hands * min(len(take.frames), max(1, MAX_BATCH // num_hands))
+def fit(
+    take: Take,
+    out: str | os.PathLike,
+    *,
+    hand: HandModel | None = None,
+    smooth: bool = False,
+    meshes: bool | None = None,
+    progress: bool = True,
+) -> Written:
+    """Fit every hand of a take to its key points, and write what `reconstruct` writes, under `out`.
 
+    Beyond that `prediction.npz` holds `joint_sigma_m (F,H,21)`, the standard deviation of one coordinate of
+    every joint, and `pose`, `shape` and `translation` of the hand model.
 
-def faces_by_side(engine: Engine) -> dict[str, Array]:
-    """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
-    right = np.asarray(engine.model.params["constants"]["hand"]["faces"])
-    return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
-
-
-def _stream(
-    take: Take, engine: Engine, reasons: Reasons, clock: Clock, progress: bool
-) -> Iterator[FrameResults]:
-    """Yield every frame's images and outcome, in order, a batch of the model at a time."""
-    group = max(1, engine.batch_size // len(take.hands.hand_side))
-    several = len(take.frames) > 1
-    with tqdm(total=len(take.frames), unit="frame", disable=not (progress and several)) as bar:
-        for start in range(0, len(take.frames), group):
-            frames = range(start, min(start + group, len(take.frames)))
-            loaded = [_load(take, frame, reasons[frame], engine.config.image_hw, several) for frame in frames]
-            clock.lap("read_and_crop")
-            samples = [sample for _, samples in loaded for sample in samples]
-            results = iter(_run(engine, samples))
-            clock.lap("first_batch_with_compilation" if start == 0 else "later_batches")
-            for frame, (found, samples) in zip(frames, loaded, strict=True):
-                hands = tuple(
-                    hand_outcome(take, frame, hand, sample, next(results), reasons[frame][hand])
-                    for hand, sample in enumerate(samples)
-                )
-                _warn(take, frame, found, reasons[frame])
-                yield FrameResults(found.images, FrameOutcome(hands, found.problems))
-                bar.update()
-
-
-def _load(
-    take: Take, frame: int, reasons: tuple[str | None, ...], image_hw: tuple[int, int], go_on: bool
-) -> tuple[FrameImages, list[HandSample]]:
-    """Read a frame and crop its hands; hands with a reason against them, and lost images, are masked.
+    Args:
+        take: From `read_keypoint_take`, or from `read_take` where the boxes come with key points.
+        out: Folder for the results.
+        hand: The user's hand in MANO's schema, of either side; None = the shipped hand.
+        smooth: Add a second pass that holds each hand's frames together.
+        meshes: Write the meshes of every frame; None = if there is only one.
+        progress: Show a progress bar when there are several frames.
 
     Raises:
-        FileNotFoundError, ValueError: An image with a box in it is lost, and this frame is the only one.
+        FileNotFoundError, ValueError: No key points; fewer than two views; the rig does not fit the key
+            points, or its unit is wrong; no hand can be fitted; nothing can be written to `out`.
+        KeyboardInterrupt: Ctrl-C, after what was done has been written.
     """
-    found = read_frame(take, frame)
-    needed = next((problem.error for problem in found.problems if problem.needed), None)
-    if needed is not None and not go_on:
-        raise needed
-    samples = [
-        empty_sample(take.rig.num_views, image_hw)
-        if reason is not None
-        else make_sample(found.images, take.rig, take.hands, frame, hand, image_hw)
-        for hand, reason in enumerate(reasons)
-    ]
-    return found, samples
+    from poem_jax.hand.template import default_hand
+
+    check_folder_is_writable(out)
+    clock = Clock()
+    hands = hands_of(default_hand() if hand is None else hand)
+    engine = functools.partial(by_fit, hands=hands, smooth=smooth)
+    about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
+    faces = {"right": hands.right.faces, "left": hands.left.faces}
+    return _run(take, Path(out), engine, faces, clock, about, meshes, progress)
 
 
-def _warn(take: Take, frame: int, found: FrameImages, reasons: tuple[str | None, ...]) -> None:
-    """Say what of a frame is left out."""
-    name = take.frames[frame].name
-    for problem in found.problems:
-        _log.warning("frame %s: an image is left out: %s", name, problem.error)
-    for hand, reason in zip(take.hand_names, reasons, strict=True):
-        if reason is not None:
-            _log.warning("frame %s: hand '%s' is left out: %s", name, hand, reason)
+def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Network) -> Iterator[Frame]:
+    """Find hands in images: boxes that do not fit together are marked before any image is read."""
+    config = network.config
+    frames = clock.timed("judge_boxes", judge_boxes(frames, take.rig))
+    frames = clock.timed("read", read_images(frames, take.rig, go_on=take.num_frames != 1))
+    frames = clock.timed("crop", crop_hands(frames, take.rig, _crop_ratio(config), config.image_hw))
+    return clock.timed("predict", predict_hands(frames, take, network))
 
 
-def _run(engine: Engine, samples: list[HandSample]) -> list[HandResult]:
-    starts = range(0, len(samples), engine.batch_size)
-    chunks = (samples[start : start + engine.batch_size] for start in starts)
-    return [result for chunk in chunks for result in reconstruct_samples(engine, chunk)]
+def by_fit(frames: Iterable[Frame], take: Take, clock: Clock, hands: Hands, smooth: bool) -> Iterator[Frame]:
+    """Find hands from key points; images are read afterwards, to be drawn on."""
+    frames = clock.timed("predict", fit_hands(frames, take, hands, smooth=smooth))
+    return clock.timed("read", read_images(frames, take.rig, needed=False))
+
+
+def _run(
+    take: Take,
+    out: Path,
+    engine: Engine,
+    faces: Mapping[str, Int[Array, "face 3"]],
+    clock: Clock,
+    about: Mapping[str, Any],
+    meshes: bool | None,
+    progress: bool,
+) -> Written:
+    """Run the line, in a world whose origin is near the cameras."""
+    single = take.num_frames == 1
+    origin_world = distant_origin(take.rig.T_cam_from_world)
+    rig = take.rig._replace(T_cam_from_world=move_origin(take.rig.T_cam_from_world, origin_world))
+    take = take._replace(rig=rig)
+    frames = engine(take.frames, take, clock)
+    frames = clock.timed("judge", judge_hands(frames, rig))
+    frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
+    style = Style(faces, single if meshes is None else meshes, not single, origin_world)
+    return write_results(frames, take, out, style, clock, about)
+
+
+def _crop_ratio(config: Any) -> float:
+    return config.crop.ratio if hasattr(config, "crop") else 1.5

@@ -33,12 +33,15 @@ class Fit:
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
     """Hold the frames of a take together in a second pass."""
+    meshes: Flag = False
+    """Write the meshes of every frame of a take too, not only its animation."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
     def run(self) -> None:
         """Write the results and print where they are."""
-        from poem_jax.capture.fit import fit, read_keypoint_take
+        from poem_jax.capture.pipeline import fit
+        from poem_jax.capture.take import read_keypoint_take
         from poem_jax.io.writable import check_folder_is_writable
 
         check_folder_is_writable(self.out)
@@ -46,7 +49,8 @@ class Fit:
         hand = hand_from(self.mano)
         say(f"{len(take.frames)} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):
-            written = fit(take, self.out, hand=hand, smooth=self.smooth)
+            meshes = self.meshes or None
+            written = fit(take, self.out, hand=hand, smooth=self.smooth, meshes=meshes)
         print_files(written, self.out)
         print_summary(written.report)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from poem_jax.capture.results import Written
+    from poem_jax.capture.write import Written
 
 
 def say(text: str) -> None:

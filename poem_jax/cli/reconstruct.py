@@ -7,7 +7,7 @@ from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is
 from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
 
 if TYPE_CHECKING:
-    from poem_jax.capture.results import Written
+    from poem_jax.capture.write import Written
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Reconstruct:
     """With --engine fit, as for `poem fit`."""
     smooth: Flag = False
     """With --engine fit, as for `poem fit`."""
+    meshes: Flag = False
+    """Write the meshes of every frame of a take too, not only its animation."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
@@ -57,14 +59,14 @@ class Reconstruct:
 
         take = read_take(self.folder, self.rig, self.boxes)
         say(f"{len(take.frames)} frames; the first run on a machine compiles the model, once")
-        return reconstruct(take, self.out, checkpoint=self.checkpoint)
+        return reconstruct(take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None)
 
     def _fit(self) -> "Written":
-        from poem_jax.capture.fit import fit
+        from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
         from poem_jax.cli.fit import hand_from
 
         take = read_take(self.folder, self.rig, self.boxes)
         hand = hand_from(self.mano)
         say(f"{len(take.frames)} frames; the first run on a machine compiles the fit, once")
-        return fit(take, self.out, hand=hand, smooth=self.smooth)
+        return fit(take, self.out, hand=hand, smooth=self.smooth, meshes=self.meshes or None)

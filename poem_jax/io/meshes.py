@@ -13,6 +13,10 @@ from poem_jax.io.atomic import whole_file
 from poem_jax.typing import Array, Float, Int
 
 SKIN_RGB = (224, 172, 138)
+GENERATOR = "poem_jax"
+"""Stands in every mesh file that this package writes; see `is_own_mesh`."""
+_WHERE_OURS_SAY_SO = 256
+"""Bytes at the beginning of a file in which the generator is looked for."""
 
 
 def write_mesh(
@@ -41,10 +45,20 @@ def write_mesh(
     mesh = _trimesh(vertices, faces, rgb)
     with whole_file(path) as temporary:
         if path.suffix == ".glb":
-            mesh.export(temporary, file_type="glb", include_normals=True)
+            mesh.export(temporary, file_type="glb", include_normals=True, tree_postprocessor=_sign)
         else:
-            mesh.export(temporary, file_type="obj", digits=9, include_texture=False, header=None)
+            mesh.export(temporary, file_type="obj", digits=9, include_texture=False, header=GENERATOR)
     return path
+
+
+def is_own_mesh(path: str | os.PathLike) -> bool:
+    """Tell whether a file is a mesh that this package wrote, and nobody changed since with another tool."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        start = stream.read(_WHERE_OURS_SAY_SO)
+    return start.startswith(f"# {GENERATOR}".encode()) or f'"generator":"{GENERATOR}"'.encode() in start
 
 
 def read_mesh(path: str | os.PathLike) -> tuple[Float[Array, "vert 3"], Int[Array, "face 3"]]:
@@ -66,6 +80,10 @@ def read_mesh(path: str | os.PathLike) -> tuple[Float[Array, "vert 3"], Int[Arra
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{path} must hold one triangle mesh; got {type(mesh).__name__} without faces")
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def _sign(tree: dict) -> None:
+    tree["asset"]["generator"] = GENERATOR
 
 
 def _trimesh(vertices: Array, faces: Array, rgb: tuple[int, int, int]):

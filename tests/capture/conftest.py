@@ -11,8 +11,6 @@ from poem_jax.capture.boxes_file import HandBoxes, write_boxes
 from poem_jax.capture.lens import project_raw
 from poem_jax.geometry.rig import Rig
 
-BATCH = 2
-
 
 def look_at(position, target, roll=0.0):
     """T_cam_from_world of a camera."""
@@ -82,7 +80,21 @@ def make_capture(tmp_path, rig):
 
 
 @pytest.fixture(scope="session")
-def engine(micro_model):
-    from poem_jax.capture.engine import make_engine
+def network(micro_model):
+    from poem_jax.capture.network import make_network
 
-    return make_engine(*micro_model, batch_size=BATCH)
+    return make_network(*micro_model)
+
+
+@pytest.fixture
+def run(network):
+    """Run the line over a capture on disk: `run(capture, out, network=..., meshes=...)`."""
+    from poem_jax.capture.pipeline import reconstruct
+    from poem_jax.capture.take import read_take
+
+    def start(capture, out, **options):
+        return reconstruct(
+            read_take(capture.folder), out, **{"network": network, "progress": False, **options}
+        )
+
+    return start

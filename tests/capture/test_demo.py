@@ -7,18 +7,20 @@ import pytest
 
 from poem_jax.capture.demo import demo_folder, ground_truth, mpvpe_mm
 from poem_jax.capture.lens import project_raw
-from poem_jax.capture.take import read_frame, read_take
+from poem_jax.capture.read import read_images
+from poem_jax.capture.take import read_take
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_parts_agree():
     take = read_take(demo_folder())
-    assert len(read_frame(take, 0).images) == 4
+    (frame,) = read_images(take.frames, take.rig)
+    assert len(frame.images) == 4
     vertices, joints = ground_truth()
     for view in range(4):
         pixels, _ = project_raw(take.rig, view, joints[0])
-        box = take.hands.boxes_px[0, 0, view]
+        box = frame.boxes_px[0, view]
         np.testing.assert_allclose(box, [*pixels.min(0), *pixels.max(0)], atol=1e-2)
     truth = {"vertices_world": vertices[:, None], "joints_world": joints[:, None]}
     assert mpvpe_mm(truth) == pytest.approx(0, abs=1e-6)

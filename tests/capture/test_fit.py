@@ -5,16 +5,19 @@ import logging
 import re
 
 import cv2
+import jax
 import numpy as np
 import pytest
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
-from poem_jax.capture.fit import fit, hands_of, read_keypoint_take
+from poem_jax.capture.fit import _windows, hands_of
 from poem_jax.capture.folder import FramePaths
-from poem_jax.capture.frame_padding import padded_frames
-from poem_jax.capture.take import Take
+from poem_jax.capture.frame import Frame
+from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
+from poem_jax.capture.pipeline import fit
+from poem_jax.capture.take import Take, make_take, read_keypoint_take
 from poem_jax.cli import main
 from poem_jax.geometry.distortion import distort_pixels
 from poem_jax.geometry.rig import Rig
@@ -55,11 +58,12 @@ def take(truth) -> Take:
 def with_keypoints(rig: Rig, keypoints: np.ndarray, sides=SIDES, confidence=None) -> Take:
     frames = tuple(f"{frame:04d}" for frame in range(len(keypoints)))
     hands = HandBoxes(boxes_from_keypoints(keypoints), sides, frames, keypoints, confidence)
-    return Take(rig, [FramePaths(name, (None,) * rig.num_views) for name in frames], hands)
+    return make_take(rig, [FramePaths(name, (None,) * rig.num_views) for name in frames], hands)
 
 
 def changed(take: Take, **changes) -> Take:
-    return take._replace(hands=take.hands._replace(**changes))
+    """The take with other boxes, key points, confidence or sides."""
+    return make_take(take.rig, take.frames.paths, take.frames.hands._replace(**changes))
 
 
 def error_mm(arrays, truth) -> np.ndarray:
@@ -98,7 +102,7 @@ def test_the_report_says_what_was_done(fitted):
 
 
 def test_one_bad_frame_is_marked(take, fitted, tmp_path, truth):
-    keypoints = take.hands.keypoints_px.copy()
+    keypoints = take.frames.hands.keypoints_px.copy()
     keypoints[2, 0] = np.nan
     written = fit(changed(take, keypoints_px=keypoints), tmp_path, progress=False)
     assert written.report["failed_frames"] == 0, "the other hand was found"
@@ -112,13 +116,13 @@ def test_one_bad_frame_is_marked(take, fitted, tmp_path, truth):
 
 def test_nan_confidence_counts_as_unseen(take, tmp_path):
     """A key point with NaN confidence may be anywhere."""
-    confidence = np.ones(take.hands.keypoints_px.shape[:-1])
+    confidence = np.ones(take.frames.hands.keypoints_px.shape[:-1])
     confidence[:, :, 1, 8] = np.nan
-    moved = take.hands.keypoints_px.copy()
+    moved = take.frames.hands.keypoints_px.copy()
     moved[:, :, 1, 8] += 15.0
     one, other = (
         fit(changed(take, keypoints_px=k, confidence=confidence), tmp_path / name, progress=False).arrays
-        for name, k in (("a", take.hands.keypoints_px), ("b", moved))
+        for name, k in (("a", take.frames.hands.keypoints_px), ("b", moved))
     )
     np.testing.assert_allclose(one["joints_world"], other["joints_world"], atol=1e-6)
 
@@ -148,7 +152,7 @@ def test_inverse_extrinsics_are_refused(take, tmp_path):
 
 
 def test_nothing_seen_by_two_views_is_an_error(take, tmp_path):
-    keypoints = take.hands.keypoints_px.copy()
+    keypoints = take.frames.hands.keypoints_px.copy()
     keypoints[:, :, 1:] = np.nan
     lonely = changed(take, keypoints_px=keypoints, boxes_px=boxes_from_keypoints(keypoints))
     with pytest.raises(ValueError, match="at least two views"):
@@ -161,7 +165,7 @@ def test_boxes_alone_are_not_enough(take, tmp_path):
 
 
 def test_one_camera_is_not_enough(take, tmp_path):
-    lonely = changed(take, keypoints_px=take.hands.keypoints_px[:, :, :1])
+    lonely = changed(take, keypoints_px=take.frames.hands.keypoints_px[:, :, :1])
     with pytest.raises(ValueError, match="at least two views; the rig has 1"):
         fit(lonely._replace(rig=take.rig.select(["cam_0"])), tmp_path, progress=False)
 
@@ -196,7 +200,7 @@ def test_the_wrong_side_is_noticed(take, tmp_path, caplog):
 
 def test_the_wrong_order_of_joints_is_noticed(take, tmp_path, caplog):
     mano_order = np.argsort(OPENPOSE_FROM_MANO)
-    keypoints = take.hands.keypoints_px[..., mano_order, :]
+    keypoints = take.frames.hands.keypoints_px[..., mano_order, :]
     with caplog.at_level(logging.WARNING):
         fit(changed(take, keypoints_px=keypoints), tmp_path, progress=False)
     said = [record.getMessage() for record in caplog.records]
@@ -207,9 +211,9 @@ def test_the_wrong_order_of_joints_is_noticed(take, tmp_path, caplog):
 @pytest.fixture
 def files(take, tmp_path):
     """The take as files, with images, one of them damaged; frame 2 has none."""
-    keypoints = write_boxes(tmp_path / "keypoints.npz", take.hands)
+    keypoints = write_boxes(tmp_path / "keypoints.npz", take.frames.hands)
     rig = write_rig(tmp_path / "rig.json", take.rig)
-    for frame in take.hands.frames:
+    for frame in take.frames.hands.frames:
         folder = tmp_path / "capture" / "frames" / frame
         folder.mkdir(parents=True)
         for name in take.rig.names if frame != "0002" else ():
@@ -229,7 +233,8 @@ def test_the_command_writes_what_reconstruct_writes(files, fitted, tmp_path, cap
     assert "cam_1.jpg" in report["frames"][3]["image_problems"][0]
     overlays = sorted(path.relative_to(out).as_posix() for path in out.glob("*/overlay_*.png"))
     assert len(overlays) == (FRAMES - 1) * VIEWS - 1
-    assert (out / "0005" / "left.glb").is_file()
+    assert not list(out.glob("*/left.glb")), "meshes of every frame are written on request"
+    assert (out / "hands.glb").is_file()
     drawn = cv2.imread(str(out / "0001" / "overlay_cam_0.png"))
     assert (drawn != 90).any()
 
@@ -261,7 +266,7 @@ def test_images_of_other_frames_are_refused(files, tmp_path):
 
 
 def test_points_beyond_the_fold_of_a_lens_are_dropped(take):
-    keypoints = take.hands.keypoints_px.copy()
+    keypoints = take.frames.hands.keypoints_px.copy()
     keypoints[0, 0, 0, 0] = 2e4, 1e4
     ideal = ideal_keypoints(take.rig, keypoints)
     assert np.isnan(ideal[0, 0, 0, 0]).all()
@@ -269,14 +274,14 @@ def test_points_beyond_the_fold_of_a_lens_are_dropped(take):
 
 
 def test_hands_outside_their_image_are_not_fitted(files, take, tmp_path, caplog):
-    keypoints = take.hands.keypoints_px.copy()
+    keypoints = take.frames.hands.keypoints_px.copy()
     keypoints[1, 0, 2, :, 0] -= 5000
     moved = write_boxes(
         tmp_path / "moved.npz",
-        take.hands._replace(keypoints_px=keypoints, boxes_px=boxes_from_keypoints(keypoints)),
+        take.frames.hands._replace(keypoints_px=keypoints, boxes_px=boxes_from_keypoints(keypoints)),
     )
     found = read_keypoint_take(moved, files[1])
-    assert np.isnan(found.hands.keypoints_px[1, 0, 2]).all()
+    assert np.isnan(found.frames.hands.keypoints_px[1, 0, 2]).all()
     assert "outside" in caplog.text
 
 
@@ -306,8 +311,63 @@ def test_smoothing_from_the_command_line(files, fitted, tmp_path):
     assert 0 < np.median(moved) < 5e-4
 
 
-@pytest.mark.parametrize(("frames", "padded"), [(1, 1), (3, 4), (8, 8), (100, 128), (129, 256), (300, 384)])
-def test_takes_are_padded_to_few_lengths(frames, padded):
+@pytest.fixture
+def compilations():
+    """What JAX compiles from here on."""
+    heard = []
+
+    def listen(event, duration, **_):
+        if "backend_compile" in event:
+            heard.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    return heard
+
+
+def longer(take: Take, count: int) -> Take:
+    """The frames of a take again and again."""
+    keypoints = take.frames.hands.keypoints_px
+    return with_keypoints(take.rig, np.resize(keypoints, (count, *keypoints.shape[1:])))
+
+
+def test_takes_of_any_length_share_compiled_programs(take, tmp_path, compilations):
+    """A take of more than one group compiles all that there is."""
+    fit(longer(take, FRAMES_TOGETHER + 2), tmp_path / "more", progress=False)
+    before = len(compilations)
+    for count in (3, 7, 2 * FRAMES_TOGETHER + 9):
+        fit(longer(take, count), tmp_path / str(count), progress=False)
+    assert len(compilations) == before
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_long_take_is_fitted_group_by_group_with_one_shape(take, tmp_path, truth, smooth):
+    count = 2 * FRAMES_TOGETHER + 9
+    written = fit(longer(take, count), tmp_path, progress=False, smooth=smooth)
+    arrays = written.arrays
+    assert arrays["frames"].tolist() == [f"{frame:04d}" for frame in range(count)]
+    assert arrays["valid"].all()
+    np.testing.assert_array_equal(arrays["shape"], np.tile(arrays["shape"][:1], (count, 1, 1)))
+    again = (np.resize(truth[0], (count, *truth[0].shape[1:])),)
+    assert np.median(error_mm(arrays, again)) < (3 if smooth else 1)
+    if not smooth:
+        whole = [np.median(error_mm(arrays, again)[start : start + 32]) for start in range(0, count, 32)]
+        assert max(whole) < 1.2 * min(whole), "no group is worse than another"
+
+
+def test_every_frame_has_its_turn_once_and_with_its_neighbours():
+    names = [str(index) for index in range(2 * FRAMES_TOGETHER + 5)]
+    for context in (0, 16):
+        turns = []
+        for window, places in _windows(iter([Frame(name, None) for name in names]), context):
+            assert len(window) <= FRAMES_TOGETHER
+            for place in places:
+                turns.append(window[place].name)
+                assert place >= min(context, int(turns[-1])), "neighbours before"
+        assert turns == names
+
+
+@pytest.mark.parametrize(("frames", "padded"), [(1, 64), (64, 64), (100, 128)])
+def test_groups_of_frames_are_padded_to_one_length(frames, padded):
     array = np.arange(2.0 * frames).reshape(frames, 2)
     longer = padded_frames(array)
     assert longer.shape == (padded, 2)

@@ -4,10 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from poem_jax.capture.boxes_file import HandBoxes
-from poem_jax.capture.crops import EXPAND_RATIO, crop_box, crop_hand
+from poem_jax.capture.crop import crop_image
 from poem_jax.capture.lens import picture_map, project_raw, take_picture
-from poem_jax.capture.outputs import make_gallery
+from poem_jax.capture.page_pictures import make_gallery
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.distortion import undistort_pixels
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
@@ -58,9 +57,9 @@ def test_a_3d_point_lands_at_its_pixel_of_the_crop(rig, view, side_px):
     width, height = rig.size_wh[view]
     ideal = undistort_pixels(raw_px[None], rig.K[view], rig.dist[view])[0]
     box = np.array([*(ideal - 0.45 * side_px), *(ideal + 0.55 * side_px)])
-    crop = crop_hand(blob((height, width), raw_px), rig.K[view], rig.dist[view], box, CROP_HW)
-    expected = project(crop.K, rig.T_cam_from_world[view], point)[0][0]
-    np.testing.assert_allclose(centroid(crop.image), expected, atol=0.06)
+    image, K = crop_image(blob((height, width), raw_px), rig, view, box, CROP_HW)
+    expected = project(K, rig.T_cam_from_world[view], point)[0][0]
+    np.testing.assert_allclose(centroid(image), expected, atol=0.06)
 
 
 def test_a_picture_with_the_cameras_own_K_and_no_distortion_is_the_photograph(rig):
@@ -94,27 +93,6 @@ def test_beyond_the_fold_of_the_lens_is_black():
         assert (picture[radius > 1.1] == 0).all()
 
 
-def test_crop_boxes_follow_the_training_rule(rig):
-    uv = np.random.default_rng(0).uniform([60, 50], [170, 120], (21, 2))
-    raw_box = np.array([*uv.min(0), *uv.max(0)])
-    boxes = np.full((1, 1, 3, 4), np.nan)
-    boxes[0, 0, :2] = raw_box
-    by_box = HandBoxes(boxes, ("right",))
-    assert crop_box(by_box, 0, 0, 2, rig) is None
-    keypoints = np.full((1, 1, 3, 21, 2), np.nan)
-    keypoints[0, 0, 0] = uv
-    by_points = by_box._replace(keypoints_px=keypoints)
-    ideal = undistort_pixels(uv, rig.K[0], rig.dist[0])
-    box = crop_box(by_points, 0, 0, 0, rig)
-    np.testing.assert_allclose(box[2:] - box[:2], EXPAND_RATIO * (ideal.max(0) - ideal.min(0)).max())
-    np.testing.assert_allclose((box[2:] + box[:2]) / 2, (ideal.max(0) + ideal.min(0)) / 2)
-    outer = crop_box(by_box, 0, 0, 0, rig)
-    assert outer[2] - outer[0] >= box[2] - box[0]
-    np.testing.assert_allclose(outer, box, atol=12)
-    # A view whose key points are too few falls back on its box.
-    np.testing.assert_allclose(crop_box(by_points, 0, 0, 1, rig), crop_box(by_box, 0, 0, 1, rig))
-
-
 def test_a_turned_picture_shows_points_where_its_pinhole_sees_them(rig):
     point = np.array([[0.05, -0.03, 0.02]])
     K = np.array([[150.0, 0, 60], [0, 150, 50], [0, 0, 1]])
@@ -136,7 +114,7 @@ def test_the_pages_pictures_fill_their_frames(rig):
     """Also where the principal point is far from the middle, as in a picture cut out of a larger one."""
     K = rig.K.copy()
     K[:, 0, 2] += 100
-    gallery = make_gallery(rig._replace(K=K, dist=np.zeros((3, 5))))
+    gallery = make_gallery(rig._replace(K=K, dist=np.zeros((3, 5))), 1)
     white = np.full((180, 240, 3), 255, np.uint8)
     for camera, where in zip(gallery.cameras, gallery.maps, strict=True):
         picture = take_picture(white, where)

@@ -1,0 +1,183 @@
+"""The stage `predict` by a network: crops of hands in, hands in the capture's world out.
+
+The models know right hands. A left hand is reconstructed in the world mirrored by D = diag(-1, 1, 1):
+extrinsics D T D, images flipped, principal points W - cx; what comes back is mirrored again. Both happen
+here, around the prediction, and nowhere else.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from poem_jax.batch import Prediction
+from poem_jax.capture.frame import Frame, HandCrops, HandResult, in_groups
+from poem_jax.capture.take import Take
+from poem_jax.geometry.cameras import (
+    Cameras,
+    mirror_intrinsics,
+    mirror_pixels,
+    mirror_points,
+    mirror_world,
+    normalised_from_pixels,
+    pixels_from_normalised,
+)
+from poem_jax.geometry.distortion import distort
+from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.transforms import transform_points
+from poem_jax.hand.model import mirror_pose
+from poem_jax.models.config import Config
+from poem_jax.models.inference import Prepared, prepare, run_packed
+from poem_jax.typing import Array, Int, Params
+from poem_jax.weights import store
+
+MAX_BATCH = 4
+"""Hands at a time: enough to keep two cores busy, little enough to wait for."""
+UNDETERMINED = (
+    "the views do not determine where the hand is: they stand at one place, or their rays do not cross"
+)
+
+
+class Network(NamedTuple):
+    """A model in memory, ready to predict."""
+
+    config: Config
+    prepared: Prepared
+    origin: str = "given"
+    """Where the weights came from, for the report."""
+    predict: Callable[[Prepared, Array, Cameras], Prediction] = run_packed
+
+    def faces(self) -> dict[str, Int[Array, "face 3"]]:
+        """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
+        right = np.asarray(self.prepared.params["constants"]["hand"]["faces"])
+        return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
+
+
+def load_network(checkpoint: str | os.PathLike | None) -> Network:
+    """Load a checkpoint folder, or the shipped weights for None.
+
+    Raises: FileNotFoundError, ValueError: As `poem_jax.load`.
+    """
+    config, params = store.shipped() if checkpoint is None else store.load(checkpoint)
+    return make_network(config, params, "shipped weights" if checkpoint is None else str(checkpoint))
+
+
+def make_network(config: Config, params: Params, origin: str = "given") -> Network:
+    """Prepare a model in memory."""
+    return Network(config, prepare(params, config), origin)
+
+
+def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iterator[Frame]:
+    """Reconstruct the hands of a stream from their crops, some frames at a time.
+
+    The batch is padded with masked hands, so that one program serves takes of any length.
+    """
+    num_hands = len(take.hand_sides)
+    frames_together = max(1, MAX_BATCH // num_hands)
+    for group in in_groups(frames, frames_together):
+        crops = [_seen_by_two(crop) for frame in group for crop in frame.crops]
+        sides = take.hand_sides * len(group)
+        fed = [
+            _mirrored(crop) if crop and side == "left" else crop
+            for crop, side in zip(crops, sides, strict=True)
+        ]
+        predicted = iter(_predict(network, fed, take.rig.num_views, frames_together * num_hands))
+        for frame in group:
+            results = (
+                _result(crop, next(predicted), known, side, take.rig)
+                for crop, known, side in zip(frame.crops, frame.hands, take.hand_sides, strict=True)
+            )
+            yield frame._replace(hands=tuple(results), crops=())
+
+
+def _seen_by_two(crops: HandCrops | None) -> HandCrops | None:
+    return None if crops is None or crops.view_mask.sum() < 2 else crops
+
+
+def _mirrored(crops: HandCrops) -> HandCrops:
+    """Return the capture of the mirrored hand in the mirrored world; its own inverse."""
+    return HandCrops(
+        np.ascontiguousarray(crops.views[:, :, ::-1]),
+        mirror_intrinsics(crops.K, crops.views.shape[2]),
+        mirror_world(crops.T_cam_from_world),
+        crops.view_mask,
+    )
+
+
+def _predict(
+    network: Network, hands: Sequence[HandCrops | None], num_views: int, batch_size: int
+) -> list[Prediction | None]:
+    """Run a batch, in which None and what is missing is masked; return one prediction per hand."""
+    height, width = network.config.image_hw
+    masked = HandCrops(
+        np.zeros((num_views, height, width, 3), np.uint8),
+        np.tile(np.eye(3, dtype=np.float32), (num_views, 1, 1)),
+        np.tile(np.eye(4, dtype=np.float32), (num_views, 1, 1)),
+        np.zeros(num_views, bool),
+    )
+    padded = [hand or masked for hand in hands] + [masked] * (batch_size - len(hands))
+    views, K, T_cam_from_world, view_mask = (np.stack(part) for part in zip(*padded, strict=True))
+    cams = Cameras(K, T_cam_from_world, view_mask)
+    if not view_mask.any():
+        return [None] * len(hands)
+    batch = jax.device_get(network.predict(network.prepared, views, cams))
+    return [
+        Prediction(*(None if field is None else field[index] for field in batch._replace(layers_world=None)))
+        for index in range(len(hands))
+    ]
+
+
+def _result(
+    crops: HandCrops | None, predicted: Prediction | None, known: HandResult, side: str, rig: Rig
+) -> HandResult:
+    """Bring a prediction back to the capture's world, or say why there is none."""
+    if crops is None:
+        return known
+    views = int(crops.view_mask.sum())
+    if views < 2:
+        return HandResult(crops.view_mask, f"seen in {views} view(s); two are needed")
+    if predicted is None or not predicted.valid:
+        return HandResult(crops.view_mask, UNDETERMINED)
+    if side == "left":
+        predicted = _mirrored_back(predicted, crops.views.shape[2])
+    behind = _behind(predicted.root_world, crops, rig)
+    if behind:
+        return HandResult(crops.view_mask, f"the hand would lie behind camera {', '.join(behind)}")
+    return HandResult(
+        crops.view_mask,
+        vertices_world=predicted.vertices_world,
+        joints_world=predicted.joints_world,
+        root_world=predicted.root_world,
+        pose=predicted.pose,
+        shape=predicted.shape,
+        translation=predicted.translation,
+        keypoints_px=_in_photographs(predicted.keypoints_px, crops, rig),
+    )
+
+
+def _mirrored_back(predicted: Prediction, crop_width: int) -> Prediction:
+    """Bring a prediction for `_mirrored` crops back to the world that they were mirrored from."""
+    return predicted._replace(
+        vertices_world=mirror_points(predicted.vertices_world),
+        joints_world=mirror_points(predicted.joints_world),
+        root_world=mirror_points(predicted.root_world),
+        keypoints_px=mirror_pixels(predicted.keypoints_px, crop_width),
+        pose=None if predicted.pose is None else mirror_pose(predicted.pose),
+        translation=None if predicted.translation is None else mirror_points(predicted.translation),
+    )
+
+
+def _behind(root_world: Array, crops: HandCrops, rig: Rig) -> list[str]:
+    """Name the cameras that cannot have seen the root."""
+    root = np.asarray(root_world, np.float64)
+    depth = transform_points(rig.T_cam_from_world, root[None, None])[:, 0, 2]
+    return [repr(rig.names[view]) for view in np.flatnonzero(crops.view_mask & (depth <= 0))]
+
+
+def _in_photographs(keypoints_px: Array, crops: HandCrops, rig: Rig) -> Array:
+    """Move pixels of the crops to the raw photographs; views that were not used hold NaN."""
+    rays = normalised_from_pixels(crops.K.astype(np.float64), keypoints_px.astype(np.float64))
+    raw = pixels_from_normalised(rig.K, distort(rays, rig.dist))
+    return np.where(crops.view_mask[:, None, None], raw, np.nan)

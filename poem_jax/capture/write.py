@@ -1,0 +1,227 @@
+"""The stage `write`: what a reconstruction leaves on disk, written as the frames come.
+
+Every file appears whole or not at all. If the stream ends early, by Ctrl-C or an error, what was done is
+written before the exception goes on its way.
+"""
+
+import functools
+import json
+import logging
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from poem_jax.capture.frame import Frame
+from poem_jax.capture.lens import project_raw
+from poem_jax.capture.page_pictures import PageFrames, make_gallery, page_frame
+from poem_jax.capture.prediction_file import PredictionFile
+from poem_jax.capture.report import Clock, Report
+from poem_jax.capture.take import Take
+from poem_jax.io.animated_glb import AnimatedGlb
+from poem_jax.io.atomic import whole_file
+from poem_jax.io.file_names import safe_file_name, safe_file_names
+from poem_jax.io.meshes import is_own_mesh, write_mesh
+from poem_jax.typing import Array, Float, Int, UInt8
+from poem_jax.viz.overlay import MeshInView, draw_overlay
+from poem_jax.viz.page import HAND_RGB, HOW_TO_GET_THE_PAGE, page_available, write_page
+
+MESH_SUFFIXES = (".glb", ".obj")
+PREDICTION, REPORT, PAGE, ANIMATION = "prediction.npz", "report.json", "index.html", "hands.glb"
+SECONDS_PER_FRAME = 1 / 30
+"""Of the animation: what video cameras take; a capture does not say."""
+
+_log = logging.getLogger(__name__)
+
+
+class Written(NamedTuple):
+    """What a reconstruction gave; the rest is on disk."""
+
+    out: Path
+    files: list[Path]
+    """Everything that was written."""
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The arrays of `prediction.npz`, read at every use."""
+        with np.load(self.out / PREDICTION) as stored:
+            return dict(stored)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The content of `report.json`, read at every use."""
+        return json.loads((self.out / REPORT).read_text(encoding="utf-8"))
+
+
+class Style(NamedTuple):
+    """How hands are written."""
+
+    faces: Mapping[str, Int[Array, "face 3"]]
+    """Triangles by side."""
+    meshes: bool
+    """Whether to write the meshes of each frame."""
+    animation: bool
+    """Whether to write one animated mesh of the take."""
+    origin_world: Float[Array, "3"]
+    """Where the world in which the frames come has its origin in the capture's world."""
+
+
+def write_results(
+    frames: Iterable[Frame], take: Take, out: Path, style: Style, clock: Clock, about: Mapping[str, Any]
+) -> Written:
+    """Write meshes, overlays, arrays, page and report under `out`, `out/<frame>/...`, as the frames come.
+
+    Args:
+        frames: Judged, in order.
+        take: The capture.
+        out: Folder for the results.
+        style: How to write.
+        clock: What the report says of times.
+        about: What the report says of the engine.
+
+    Raises:
+        FileNotFoundError, ValueError: No hand came out of the whole take; why.
+    """
+    safe_file_names(take.rig.names, "names of cameras")
+    writer = _Writer(take, out, style)
+    try:
+        for frame in frames:
+            writer.add(frame)
+        writer.report.check_any()
+    except BaseException as stop:
+        if writer.report.solved:
+            name = "an interruption" if isinstance(stop, KeyboardInterrupt) else f"an error ({stop})"
+            _log.warning("stopped by %s; %s holds the first %d frames", name, out, writer.report.frames)
+            writer.finish(clock, {**about, "stopped_by": type(stop).__name__})
+        raise
+    else:
+        writer.finish(clock, about)
+    finally:
+        writer.close()
+    return Written(out, writer.files)
+
+
+class _Writer:
+    """The files of one run, open while its frames come."""
+
+    def __init__(self, take: Take, out: Path, style: Style) -> None:
+        self.files: list[Path] = []
+        self.report = Report(out / REPORT, take)
+        self._take, self._out, self._style = take, out, style
+        self._prediction = PredictionFile(out / PREDICTION, take, style.origin_world)
+        self._animation = AnimatedGlb(
+            out / ANIMATION,
+            {name: style.faces[side] for name, side in self._hands()},
+            {name: HAND_RGB[side] for name, side in self._hands()},
+            seconds_per_frame=SECONDS_PER_FRAME,
+            origin=style.origin_world,
+        )
+        self._gallery = make_gallery(take.rig, take.num_frames)
+        self._pages = PageFrames()
+
+    def add(self, frame: Frame) -> None:
+        """Write what belongs to a frame alone, and take it into what belongs to all."""
+        for warning in self.report.add(frame):
+            _log.warning("%s", warning)
+        self._say_what_is_lost(frame)
+        folder = frame_folder(self._out, frame.name)
+        vertices = {
+            name: hand.vertices_world
+            for name, hand in zip(self._take.hand_names, frame.hands, strict=True)
+            if hand.vertices_world is not None
+        }
+        self._write_meshes(folder, vertices)
+        self._write_overlays(folder, frame, vertices)
+        self._prediction.add(frame)
+        if self._style.animation:
+            self._animation.add(vertices)
+        if vertices:
+            self._pages.offer(
+                functools.partial(page_frame, frame.name, vertices, frame.images, self._gallery)
+            )
+
+    def finish(self, clock: Clock, about: Mapping[str, Any]) -> None:
+        """Write what belongs to all frames."""
+        self.files.append(self._prediction.write())
+        if self._style.animation:
+            self.files.append(self._animation.write())
+        elif is_own_mesh(self._out / ANIMATION):
+            (self._out / ANIMATION).unlink()
+        self._write_page()
+        self.files.append(self.report.write(clock.rounded(), about))
+
+    def close(self) -> None:
+        """Let go of what is not needed any more."""
+        for part in (self._prediction, self.report, self._animation):
+            part.close()
+
+    def _hands(self) -> Iterable[tuple[str, str]]:
+        return zip(self._take.hand_names, self._take.hand_sides, strict=True)
+
+    def _write_meshes(self, folder: Path, vertices: Mapping[str, Array]) -> None:
+        """Write the meshes of a frame; remove those of an earlier run that this one does not write."""
+        for name, side in self._hands():
+            for path in (folder / f"{name}{suffix}" for suffix in MESH_SUFFIXES):
+                if self._style.meshes and name in vertices:
+                    in_world = vertices[name] + self._style.origin_world
+                    self.files.append(write_mesh(path, in_world, self._style.faces[side]))
+                elif is_own_mesh(path):
+                    path.unlink()
+
+    def _write_overlays(self, folder: Path, frame: Frame, vertices: Mapping[str, Array]) -> None:
+        rig, sides = self._take.rig, dict(self._hands())
+        for view, image in enumerate(frame.images):
+            if image is None:
+                continue
+            meshes = [
+                MeshInView(
+                    *project_raw(rig, view, mesh), self._style.faces[sides[name]], HAND_RGB[sides[name]]
+                )
+                for name, mesh in vertices.items()
+            ]
+            path = folder / f"overlay_{rig.names[view]}.png"
+            self.files.append(write_png(path, draw_overlay(image, meshes)))
+
+    def _write_page(self) -> None:
+        """Write the page if that can be done here; a warning says why not. The rest does not need it."""
+        if not page_available():
+            _log.warning(HOW_TO_GET_THE_PAGE)
+            return
+        try:
+            page = write_page(self._out / PAGE, self._pages.kept, self._gallery.cameras, self._style.faces)
+            self.files.append(page)
+        except OSError as error:  # It takes a free port to record a page.
+            _log.warning("the 3D page cannot be written, everything else is: %s", error)
+
+    def _say_what_is_lost(self, frame: Frame) -> None:
+        views = np.isfinite(frame.boxes_px).all(-1).sum(-1)
+        for name, hand, seen in zip(self._take.hand_names, frame.hands, views, strict=True):
+            if hand.reason is not None and seen > 1:
+                _log.warning("frame %s: hand '%s' is left out: %s", frame.name, name, hand.reason)
+
+
+def frame_folder(out: Path, name: str) -> Path:
+    """Return the folder of a frame's own files, which lies in `out` itself.
+
+    Raises:
+        ValueError: The name cannot be that of a folder, belongs to a file of the take, or is a link that
+            leads elsewhere.
+    """
+    if safe_file_name(name, "a frame's name") in (PREDICTION, REPORT, PAGE, ANIMATION):
+        raise ValueError(f"a frame cannot be called {name!r}: a file of the results has this name")
+    folder = out / name
+    if folder.is_symlink():
+        raise ValueError(f"{folder} is a link that leads out of the folder of results: give another --out")
+    return folder
+
+
+def write_png(path: Path, image: UInt8[Array, "h w 3"]) -> Path:
+    """Write an RGB image."""
+    with whole_file(path) as temporary:
+        ok, data = cv2.imencode(".png", image[..., ::-1])
+        if not ok:
+            raise OSError(f"cannot encode {path} as PNG")
+        temporary.write_bytes(data.tobytes())
+    return path
