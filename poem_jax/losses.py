@@ -19,6 +19,7 @@ from poem_jax.geometry.transforms import (
     axis_angle_from_rotation,
     matmul,
     quaternion_from_rotation,
+    rotate_points,
     rotation_from_axis_angle,
 )
 from poem_jax.hand.model import HandModel, joints_from_vertices
@@ -275,7 +276,7 @@ def _point_terms(
     rotation = T_primary_from_world[..., :3, :3]
 
     def difference(a_world: Array, b_world: Array) -> Array:
-        return jnp.einsum("bij,bnj->bni", rotation, a_world - b_world) / recipe.point_unit_m
+        return rotate_points(rotation, a_world - b_world) / recipe.point_unit_m
 
     def mean(residual: Array, penalty: Penalty) -> Array:
         return masked_mean(_punish(residual, penalty), sample_mask, axis_name=axis_name)

@@ -8,7 +8,7 @@ import numpy as np
 from poem_jax.capture.lens import PictureMap, picture_map, take_picture
 from poem_jax.geometry.distortion import undistort_pixels
 from poem_jax.geometry.rig import Rig
-from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
+from poem_jax.geometry.transforms import rigid, smallest_rotation
 from poem_jax.typing import Array, Float
 from poem_jax.viz.page import PageCamera, PageFrame
 
@@ -70,7 +70,7 @@ def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureM
     width, height = (int(size) for size in rig.size_wh[view])
     x, y = undistort_pixels(np.array([[width / 2, height / 2]]), K, dist)[0]
     ray = np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
-    R_cam_from_picture = rotation_from_axis_angle(_turn_to(ray))
+    R_cam_from_picture = smallest_rotation(np.array([0.0, 0.0, 1.0]), ray)
     scale = longer / max(width, height)
     # Off its axis an image is stretched by the squared length of the ray.
     focal_px = float(scale * (K[0, 0] + K[1, 1]) / 2 * (ray @ ray))
@@ -79,10 +79,3 @@ def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureM
     T_picture_from_world = rigid(R_cam_from_picture.T, np.zeros(3)) @ rig.T_cam_from_world[view]
     where = picture_map(K, dist, K_picture, hw, 1 / scale, R_cam_from_picture)
     return PageCamera(rig.names[view], T_picture_from_world, focal_px, hw), where
-
-
-def _turn_to(ray: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the axis-angle that turns the z axis to a ray."""
-    axis = np.cross([0.0, 0.0, 1.0], ray)
-    sine = np.linalg.norm(axis)
-    return axis / max(float(sine), 1e-12) * np.arctan2(sine, ray[2])

@@ -31,7 +31,7 @@ from poem_jax.fitting.silhouette import (
 from poem_jax.geometry.cameras import projection_jacobian
 from poem_jax.hand.topology import WRIST
 from poem_jax.render.soft import RELEASE_SIGMA
-from poem_jax.typing import Array, Float
+from poem_jax.typing import Array, Float, Int
 
 KEYPOINT_WEIGHT = 1000.0
 ANATOMY_WEIGHT = 50.0
@@ -94,14 +94,23 @@ class AdamTrace(NamedTuple):
     """After the step, with a leading axis of steps."""
 
 
+class Plateau(NamedTuple):
+    """The step sizes, and how long the loss has not improved."""
+
+    rates: Float[Array, "3"]
+    best: Float[Array, ""]
+    waited: Int[Array, ""]
+    """Steps since the best loss."""
+
+
 class _State(NamedTuple):
     parameters: AdamParameters
     mean: AdamParameters
     square: AdamParameters
     gradient: AdamParameters
-    rates: Float[Array, "3"]
-    best: Float[Array, ""]
-    waited: Array
+    plateau: Plateau
+    count: Int[Array, ""]
+    """Steps taken."""
 
 
 def released_start(
@@ -178,24 +187,21 @@ def adam_fit(
 
     def step(state: _State, _: None) -> tuple[_State, AdamTrace | None]:
         (value, keypoints), gradient = jax.value_and_grad(loss, has_aux=True)(state.parameters)
-        after = _adam_step(state, gradient, value, count=state.waited[1] + 1, recipe=recipe)
-        return after, AdamTrace(keypoints, value, state.rates, after.parameters) if trace else None
+        after = _adam_step(state, gradient, value, recipe)
+        return after, AdamTrace(keypoints, value, state.plateau.rates, after.parameters) if trace else None
 
     state, history = jax.lax.scan(step, _first_state(start, recipe), None, length=recipe.steps)
     return state.parameters, history
 
 
 def _first_state(start: AdamParameters, recipe: AdamRecipe) -> _State:
-    zero = jax.tree.map(jnp.zeros_like, start)
+    zero, none = jax.tree.map(jnp.zeros_like, start), jnp.zeros((), jnp.int32)
     dtype = start.translation.dtype
     rates = jnp.asarray([recipe.rate, recipe.shape_rate, recipe.rate], dtype)
-    return _State(start, zero, zero, zero, rates, jnp.asarray(jnp.inf, dtype), jnp.zeros(2, jnp.int32))
+    return _State(start, zero, zero, zero, Plateau(rates, jnp.asarray(jnp.inf, dtype), none), none)
 
 
-def _adam_step(
-    state: _State, gradient: AdamParameters, value: Array, *, count: Array, recipe: AdamRecipe
-) -> _State:
-    """Return the state after one step; `waited` holds the plateau's counter and the number of steps."""
+def _adam_step(state: _State, gradient: AdamParameters, value: Array, recipe: AdamRecipe) -> _State:
     if recipe.accumulate:
         gradient = jax.tree.map(jnp.add, state.gradient, gradient)
     if recipe.clip_norm is not None:
@@ -203,16 +209,16 @@ def _adam_step(
     first, second = _BETAS
     mean = jax.tree.map(lambda m, g: first * m + (1 - first) * g, state.mean, gradient)
     square = jax.tree.map(lambda s, g: second * s + (1 - second) * g * g, state.square, gradient)
+    count = state.count + 1
     steps = count.astype(value.dtype)
     mean_bias, square_bias = 1 - first**steps, 1 - second**steps
 
     def moved(p: Array, m: Array, s: Array, rate: Array) -> Array:
         return p - rate / mean_bias * m / (jnp.sqrt(s) / jnp.sqrt(square_bias) + _EPSILON)
 
-    rates = AdamParameters(*state.rates)
+    rates = AdamParameters(*state.plateau.rates)
     parameters = jax.tree.map(moved, state.parameters, mean, square, rates)
-    new_rates, best, waited = _plateau(state, value, recipe)
-    return _State(parameters, mean, square, gradient, new_rates, best, jnp.stack([waited, count]))
+    return _State(parameters, mean, square, gradient, wait_or_halve(state.plateau, value, recipe), count)
 
 
 def _clipped(gradient: AdamParameters, bound: float) -> AdamParameters:
@@ -222,11 +228,10 @@ def _clipped(gradient: AdamParameters, bound: float) -> AdamParameters:
     return jax.tree.map(lambda g: g * factor, gradient)
 
 
-def _plateau(state: _State, value: Array, recipe: AdamRecipe) -> tuple[Array, Array, Array]:
-    """Halve the rates after more than `patience` steps without improvement; return rates, best, counter."""
-    better = value < state.best * (1 - recipe.threshold)
-    best = jnp.where(better, value, state.best)
-    waited = jnp.where(better, 0, state.waited[0] + 1)
+def wait_or_halve(plateau: Plateau, loss: Float[Array, ""], recipe: AdamRecipe) -> Plateau:
+    """Halve the rates after more than `patience` steps without a better loss; return what holds next."""
+    better = loss < plateau.best * (1 - recipe.threshold)
+    waited = jnp.where(better, 0, plateau.waited + 1)
     halve = waited > recipe.patience
-    rates = jnp.where(halve, jnp.maximum(0.5 * state.rates, recipe.min_rate), state.rates)
-    return rates, best, jnp.where(halve, 0, waited)
+    rates = jnp.where(halve, jnp.maximum(0.5 * plateau.rates, recipe.min_rate), plateau.rates)
+    return Plateau(rates, jnp.where(better, loss, plateau.best), jnp.where(halve, 0, waited))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle, transpose
+from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle, transpose, unit_vectors
 from poem_jax.hand.topology import NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE
 from poem_jax.typing import Array, Bool, Float
 
@@ -123,9 +123,9 @@ def bone_axes(
 ) -> BoneAxes:
     """Return b, u and l of every bending joint, in the joint's own frame."""
     bone = joints[..., _JOINTS, :] - joints[..., _JOINTS + 1, :]
-    b = _unit(matmul(transpose(rotations[..., 1:, :, :]), bone[..., None])[..., 0])
+    b = unit_vectors(matmul(transpose(rotations[..., 1:, :, :]), bone[..., None])[..., 0])
     up = jnp.asarray(_UP, b.dtype) * jnp.where(is_left, jnp.asarray([-1, 1, 1], b.dtype), 1)
-    l = _unit(jnp.cross(b, up))  # noqa: E741
+    l = unit_vectors(jnp.cross(b, up))  # noqa: E741
     return BoneAxes(b, jnp.cross(l, b), l)
 
 
@@ -161,8 +161,3 @@ def _grouped(restricted: Array, knuckle: Array, thumb: Array, angle: Array) -> A
     turned = angle >= MIN_ANGLE
     groups = ((restricted, _RESTRICTED), (knuckle, _KNUCKLES), (thumb, _THUMB))
     return sum(jnp.mean((value**2 * turned)[..., group], axis=-1) for value, group in groups)
-
-
-def _unit(v: Array) -> Array:
-    n2 = jnp.sum(v * v, axis=-1, keepdims=True)
-    return v / jnp.sqrt(jnp.where(n2 > 0, n2, 1))

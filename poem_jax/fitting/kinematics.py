@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from poem_jax.geometry.transforms import rotation_from_axis_angle, skew_matrix
+from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle, skew_matrix
 from poem_jax.hand.joint_limits import POSE_LIMITS, anatomical_axes
 from poem_jax.hand.model import HandModel, forward_kinematics, layer_tips
 from poem_jax.hand.topology import (
@@ -122,20 +122,18 @@ def pose_keypoints_of_rotations(
     model: KeypointModel, local: Float[Array, "*batch 16 3 3"], shape: Float[Array, "*batch 10"]
 ) -> PosedKeypoints:
     """Return the 21 key points for rotations relative to the parent joints, wrist at the origin."""
+    local, shape = jnp.asarray(local), jnp.asarray(shape)
     skeleton = model.skeleton + _directions(model.skeleton_directions, shape)
     wrist = skeleton[..., :1, :]
     skeleton = skeleton - wrist
     rest = model.points + _directions(model.point_directions, shape) - wrist
     batch = local.shape[:-3]
     features = (local[..., 1:, :, :] - jnp.eye(3, dtype=local.dtype)).reshape(*batch, -1)
-    correction = jnp.matmul(features, model.correctives.reshape(3 * NUM_FINGERS, -1).T, precision="highest")
+    correction = matmul(features, model.correctives.reshape(3 * NUM_FINGERS, -1).T)
     rest = rest.at[..., _TIPS, :].add(correction.reshape(*batch, NUM_FINGERS, 3))
     rotations, _ = forward_kinematics(local, skeleton)
     blended = _mix(model.weights, rotations)
-    below = model.weights @ _ANCESTORS
-    points = _rotate(blended, rest) + jnp.matmul(
-        below, _rotate(_bends(rotations), skeleton), precision="highest"
-    )
+    points = _rotate(blended, rest) + matmul(_carried(model), _rotate(_bends(rotations), skeleton))
     return PosedKeypoints(points, rotations, local, blended, skeleton, rest)
 
 
@@ -159,8 +157,7 @@ def shape_jacobian(model: KeypointModel, posed: PosedKeypoints) -> Float[Array, 
     pinned = model.skeleton_directions - model.skeleton_directions[:1]
     points = model.point_directions - model.skeleton_directions[:1]
     bent = jnp.sum(_bends(posed.rotations)[..., None] * pinned[:, None], axis=-2)
-    below = model.weights @ _ANCESTORS
-    moved = jnp.matmul(below, bent.reshape(*batch, NUM_SKELETON_JOINTS, -1), precision="highest")
+    moved = matmul(_carried(model), bent.reshape(*batch, NUM_SKELETON_JOINTS, -1))
     own = jnp.sum(posed.blended[..., None] * points[:, None], axis=-2)
     return own + moved.reshape(*batch, NUM_JOINTS, 3, NUM_SHAPES)
 
@@ -170,6 +167,11 @@ def rest_wrist(model: KeypointModel, shape: Float[Array, "*batch 10"]) -> Float[
     return model.skeleton[0] + _directions(model.skeleton_directions[:1], shape)[..., 0, :]
 
 
+def _carried(model: KeypointModel) -> Float[Array, "21 16"]:
+    """Return W_pa, how much of key point p is carried by joint a and those below it."""
+    return matmul(model.weights, _ANCESTORS)
+
+
 def _levers(model: KeypointModel, posed: PosedKeypoints) -> Float[Array, "*batch 21 16 3"]:
     """Return c_pj = sum_{k in or below j} w_pk (X_pk - P_j)."""
     batch = posed.points.shape[:-2]
@@ -177,10 +179,10 @@ def _levers(model: KeypointModel, posed: PosedKeypoints) -> Float[Array, "*batch
     offset = joints - _rotate(posed.rotations, posed.skeleton)
     carriers = jnp.concatenate([posed.rotations.reshape(*batch, NUM_SKELETON_JOINTS, 9), offset], axis=-1)
     split = (model.weights[:, None, :] * _ANCESTORS.T).reshape(-1, NUM_SKELETON_JOINTS)
-    mixed = jnp.matmul(split, carriers, precision="highest")
+    mixed = matmul(split, carriers)
     mixed = mixed.reshape(*batch, NUM_JOINTS, NUM_SKELETON_JOINTS, 12)
     turns = mixed[..., :9].reshape(*mixed.shape[:-1], 3, 3)
-    below = (model.weights @ _ANCESTORS)[..., None]
+    below = _carried(model)[..., None]
     return _rotate(turns, posed.rest[..., :, None, :]) + mixed[..., 9:] - below * joints[..., None, :, :]
 
 
@@ -193,7 +195,7 @@ def _corrective_jacobian(
     change = _product(skew_matrix(jnp.swapaxes(turn, -1, -2)), local[..., None, :, :])
     change = jnp.swapaxes(change.reshape(*change.shape[:-2], 9), -1, -2)
     directions = jnp.moveaxis(model.correctives.reshape(3 * NUM_FINGERS, -1, 9), 0, 1)
-    moved = jnp.matmul(directions, change, precision="highest")
+    moved = matmul(directions, change)
     moved = moved.reshape(*moved.shape[:-2], NUM_FINGERS, 3, 3)
     return _product(posed.blended[..., _TIPS, None, :, :], jnp.swapaxes(moved, -4, -3))
 
@@ -214,7 +216,7 @@ def _left_jacobian(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 def _directions(directions: Array, shape: Array) -> Array:
     """Return sum_s directions[..., s] shape_s."""
     flat = directions.reshape(-1, NUM_SHAPES)
-    moved = jnp.matmul(shape, flat.T, precision="highest")
+    moved = matmul(shape, flat.T)
     return moved.reshape(*shape.shape[:-1], *directions.shape[:-1])
 
 
@@ -226,7 +228,7 @@ def _bends(rotations: Float[Array, "*batch 16 3 3"]) -> Float[Array, "*batch 16 
 
 def _mix(weights: Array, rotations: Array) -> Array:
     flat = rotations.reshape(*rotations.shape[:-2], 9)
-    mixed = jnp.matmul(weights, flat, precision="highest")
+    mixed = matmul(weights, flat)
     return mixed.reshape(*mixed.shape[:-1], 3, 3)
 
 

@@ -41,7 +41,7 @@ from poem_jax.fitting.residuals import (
     reprojection,
     shape_prior,
 )
-from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, rotation_from_axis_angle
+from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, rotation_from_axis_angle, transpose
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS
 from poem_jax.typing import Array, Bool, Float
 
@@ -302,7 +302,7 @@ def prior_equations(
     slope = config.prior_weight * prior / sigma + excess / config.limit_sigma
     curvature = config.prior_weight / sigma**2 + (excess != 0) / config.limit_sigma**2
     g = jnp.sum(slope[..., None] * model.axes, axis=-2).reshape(-1, POSE_SIZE - 3)
-    blocks = jnp.einsum("fja,jac,jad->fjcd", curvature, model.axes, model.axes)
+    blocks = matmul(transpose(model.axes) * curvature[:, :, None, :], model.axes)
     eye = jnp.eye(NUM_SKELETON_JOINTS - 1, dtype=blocks.dtype)
     H = (blocks[:, :, :, None, :] * eye[:, None, :, None]).reshape(-1, POSE_SIZE - 3, POSE_SIZE - 3)
     return jnp.pad(H, ((0, 0), (3, 3), (3, 3))), jnp.pad(g, ((0, 0), (3, 3)))

@@ -12,7 +12,14 @@ from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints
 from poem_jax.fitting.residuals import anatomical_angles
 from poem_jax.geometry.alignment import apply_similarity, procrustes
 from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, smallest_rotation, transpose
-from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, SKELETON_FROM_OPENPOSE, WRIST
+from poem_jax.hand.topology import (
+    NUM_JOINTS,
+    NUM_SKELETON_JOINTS,
+    PALM_JOINTS,
+    SKELETON_FINGERS,
+    SKELETON_FROM_OPENPOSE,
+    WRIST,
+)
 from poem_jax.typing import Array, Bool, Float
 
 MIN_JOINTS = 3
@@ -21,10 +28,8 @@ MIN_WIDTH_M = 0.005
 """And how far, root mean square, these must lie from one line: a hand could turn about it."""
 
 _SKELETON = np.array(SKELETON_FROM_OPENPOSE)
-_CHAINS = np.arange(1, NUM_SKELETON_JOINTS).reshape(5, 3)
-_PALM = np.isin(np.arange(NUM_JOINTS), [WRIST, 1, 5, 9, 13, 17])
-"""Wrist, thumb base and knuckles: rigid, whatever the pose."""
-_HEEL = np.isin(np.arange(NUM_JOINTS), [WRIST, 1])
+_PALM = np.isin(np.arange(NUM_JOINTS), PALM_JOINTS)
+_WRIST_OR_THUMB_BASE = np.isin(np.arange(NUM_JOINTS), PALM_JOINTS[:2])
 
 
 def can_be_placed(
@@ -66,7 +71,7 @@ def closed_form_pose(
     ).points
     palm = valid & _PALM
     # The knuckles alone lie nearly on one line, about which the palm could turn.
-    enough = (jnp.sum(palm, -1) >= MIN_JOINTS) & jnp.any(valid & _HEEL, -1)
+    enough = (jnp.sum(palm, -1) >= MIN_JOINTS) & jnp.any(valid & _WRIST_OR_THUMB_BASE, -1)
     used = jnp.where(enough[..., None], palm, valid)
     fit = procrustes(rest, joints_world, with_scale=False, mask=used)
     joints = jnp.where(valid[..., None], joints_world, apply_similarity(fit, rest))
@@ -78,10 +83,10 @@ def _local_turns(
     palm: Float[Array, "*batch 3 3"], rest: Float[Array, "*batch 21 3"], joints: Float[Array, "*batch 21 3"]
 ) -> Float[Array, "*batch 16 3 3"]:
     """Return every joint's rotation relative to its parent, MANO order."""
-    turn = jnp.broadcast_to(palm[..., None, :, :], (*palm.shape[:-2], len(_CHAINS), 3, 3))
+    turn = jnp.broadcast_to(palm[..., None, :, :], (*palm.shape[:-2], len(SKELETON_FINGERS), 3, 3))
     locals_ = []
-    for depth in range(_CHAINS.shape[1]):
-        start = _SKELETON[_CHAINS[:, depth]]
+    for skeleton_joints in np.array(SKELETON_FINGERS).T:
+        start = _SKELETON[skeleton_joints]
         expected = rest[..., start + 1, :] - rest[..., start, :]
         observed = joints[..., start + 1, :] - joints[..., start, :]
         local = smallest_rotation(expected, matmul(transpose(turn), observed[..., None])[..., 0])

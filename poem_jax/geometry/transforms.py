@@ -130,7 +130,7 @@ def quaternion_from_rotation(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*ba
     rows = _matrix(xp, [[ww, x, y, z], [x, xx, xy, xz], [y, xy, yy, yz], [z, xz, yz, zz]])
     best = xp.argmax(xp.stack([ww, xx, yy, zz], axis=-1), axis=-1)
     q = xp.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / xp.sqrt(xp.sum(q * q, axis=-1, keepdims=True))
+    q = unit_vectors(q)
     return xp.where(q[..., :1] < 0, -q, q)
 
 
@@ -150,9 +150,10 @@ def smallest_rotation(
 
 
 def unit_vectors(v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-    """Scale vectors to length 1; those shorter than 1e-6 keep their direction and stay finite."""
+    """Scale vectors to length 1; a vector of length zero stays, with a finite gradient."""
     xp = array_namespace(v)
-    return v / xp.sqrt(xp.maximum(xp.sum(v * v, axis=-1, keepdims=True), 1e-12))
+    n2 = xp.sum(v * v, axis=-1, keepdims=True)
+    return v / xp.sqrt(xp.where(n2 > 0, n2, xp.ones_like(n2)))
 
 
 def rotation_from_6d(x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
@@ -177,10 +178,10 @@ def sixd_from_rotation(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 6"
     return R[..., :2, :].reshape(*R.shape[:-2], 6)
 
 
-def _normalise(xp: Any, v: Array, fallback: Array, least_square: Any) -> Array:
-    """Scale `v` to length 1, or take the unit vector `fallback` where |v|^2 <= least_square."""
+def _normalise(xp: Any, v: Array, fallback: Array, min_square: Any) -> Array:
+    """Scale `v` to length 1, or take the unit vector `fallback` where |v|^2 <= min_square."""
     n2 = xp.sum(v * v, axis=-1, keepdims=True)
-    degenerate = n2 <= least_square
+    degenerate = n2 <= min_square
     return xp.where(degenerate, fallback, v / xp.sqrt(xp.where(degenerate, xp.ones_like(n2), n2)))
 
 
@@ -189,7 +190,7 @@ def _some_perpendicular(xp: Any, b1: Array) -> Array:
     orthogonal."""
     axis = xp.eye(3, dtype=b1.dtype)[xp.argmin(xp.abs(b1), axis=-1)]
     v = axis - xp.sum(b1 * axis, axis=-1, keepdims=True) * b1
-    return v / xp.sqrt(xp.sum(v * v, axis=-1, keepdims=True))
+    return unit_vectors(v)
 
 
 def _matrix(xp: Any, rows: list[list[Array]]) -> Array:

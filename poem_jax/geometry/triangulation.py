@@ -9,7 +9,7 @@ useful down to baselines of 0.1 mm.
 import jax
 import jax.numpy as jnp
 
-from poem_jax.geometry.transforms import invert_rigid, matmul
+from poem_jax.geometry.transforms import invert_rigid, matmul, unit_vectors
 from poem_jax.typing import Array, Bool, Float
 
 MIN_BASELINE = 1e-5
@@ -48,7 +48,7 @@ def triangulate(
     usable = _usable(uv_px, weights, mask)
     rows = _rows(jnp.where(usable[..., None], uv_px, 0), _projections(K, T_cam_from_world, usable))
     if normalise_rows:
-        rows = _unit_rows(rows)
+        rows = unit_vectors(rows)
     rows = rows * (usable if weights is None else jnp.where(usable, weights, 0))[..., None, None]
     well_posed = (jnp.sum(usable, axis=-2) >= 2) & _has_baseline(T_cam_from_world, usable)
     x, singular = null_vector(_safe_system(rows, well_posed))
@@ -111,11 +111,6 @@ def _projections(K: Array, T_cam_from_world: Array, usable: Array) -> Float[Arra
 def _rows(uv_px: Array, M: Array) -> Float[Array, "*batch view point 2 4"]:
     """Return u M_2 - M_0 and v M_2 - M_1."""
     return uv_px[..., None] * M[..., None, 2:, :] - M[..., None, :2, :]
-
-
-def _unit_rows(rows: Array) -> Array:
-    n2 = jnp.sum(rows * rows, axis=-1, keepdims=True)
-    return rows / jnp.sqrt(jnp.where(n2 > 0, n2, 1))
 
 
 def _has_baseline(T_cam_from_world: Array, usable: Array) -> Bool[Array, "*batch point"]:

@@ -12,12 +12,13 @@ their axis.
 
 import numpy as np
 
+from poem_jax.geometry.transforms import unit_vectors
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.topology import (
     FINGER_NAMES,
     MANO_FINGER_NAMES,
-    NUM_FINGERS,
     NUM_SKELETON_JOINTS,
+    SKELETON_FINGERS,
     TIP_VERTICES_LAYER,
 )
 from poem_jax.typing import Float
@@ -57,19 +58,22 @@ def axes_of_fingers(points: Float[np.ndarray, "5 4 3"]) -> Float[np.ndarray, "15
         points: joints and tip of each finger at rest, fingers in MANO's order, metres, MANO's frame.
     """
     bones = (points[:, 1:] - points[:, :-1]).reshape(-1, 3)
-    twist = bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+    twist = unit_vectors(bones)
     nail = np.repeat(np.where(np.array(MANO_FINGER_NAMES)[:, None] == "thumb", _THUMB_NAIL, _UP), 3, axis=0)
-    abduction = nail - twist * (nail * twist).sum(-1, keepdims=True)
-    abduction /= np.linalg.norm(abduction, axis=-1, keepdims=True)
+    abduction = unit_vectors(nail - twist * (nail * twist).sum(-1, keepdims=True))
     return np.stack([np.cross(abduction, twist), abduction, twist], axis=-2)
+
+
+def resting_fingers(hand: HandModel) -> Float[np.ndarray, "5 4 3"]:
+    """Return joints and tip of each finger of a resting right hand, fingers in MANO's order, metres."""
+    template = np.asarray(hand.v_template, float)
+    joints = (np.asarray(hand.J_regressor, float) @ template)[np.array(SKELETON_FINGERS)]
+    tips = template[np.array(TIP_VERTICES_LAYER)[_MANO_FROM_OPENPOSE_FINGER]]
+    return np.concatenate([joints, tips[:, None]], axis=1)
 
 
 def anatomical_axes(hand: HandModel) -> Float[np.ndarray, "15 3 3"]:
     """Return `axes_of_fingers` for the mean shape of any hand in MANO's frame, left hands by mirroring."""
     hand = HandModel(*(np.asarray(array) for array in hand))
-    right = mirror(hand) if hand.is_left else hand
-    joints = right.J_regressor @ right.v_template
-    tips = right.v_template[np.array(TIP_VERTICES_LAYER)[_MANO_FROM_OPENPOSE_FINGER]]
-    points = np.concatenate([joints[1:].reshape(NUM_FINGERS, 3, 3), tips[:, None]], axis=1)
-    axes = axes_of_fingers(points.astype(float))
+    axes = axes_of_fingers(resting_fingers(mirror(hand) if hand.is_left else hand))
     return axes * _MIRROR_AXES if hand.is_left else axes

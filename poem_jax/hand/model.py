@@ -14,11 +14,11 @@ import numpy as np
 
 from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle
 from poem_jax.hand.topology import (
-    MANO_PARENTS,
     NUM_POSE_FEATURES,
     NUM_SHAPES,
     NUM_SKELETON_JOINTS,
     NUM_VERTICES,
+    SKELETON_FINGERS,
     TIP_VERTICES_LAYER,
     TIP_VERTICES_LAYER_LEFT,
     TIP_VERTICES_REGRESSED,
@@ -26,8 +26,6 @@ from poem_jax.hand.topology import (
 )
 from poem_jax.typing import Array, Bool, Float, Int, array_namespace
 
-_CHAIN_FIRST = np.array([1, 4, 7, 10, 13])
-_CHAINS = np.stack([_CHAIN_FIRST, _CHAIN_FIRST + 1, _CHAIN_FIRST + 2], axis=-1)
 _MIRROR_SIGN = np.array([-1.0, 1.0, 1.0], dtype=np.float32)
 
 
@@ -195,8 +193,7 @@ def forward_kinematics(
     turn = rotations[..., None, 0, :, :]
     place, rest = skeleton[..., None, 0, :], skeleton[..., None, 0, :]
     wrist = (turn, place)
-    for depth in range(3):
-        joints = _CHAINS[:, depth]
+    for joints in np.array(SKELETON_FINGERS).T:
         place = place + _rotate(turn, skeleton[..., joints, :] - rest)
         rest = skeleton[..., joints, :]
         turn = matmul(turn, rotations[..., joints, :, :])
@@ -217,8 +214,3 @@ def _rotate(matrices: Array, vectors: Array) -> Array:
 
 def _moved(mesh: HandMesh, offset: Float[Array, "*batch 3"]) -> HandMesh:
     return HandMesh(mesh.vertices + offset[..., None, :], mesh.joints + offset[..., None, :])
-
-
-assert tuple(MANO_PARENTS[j] for j in _CHAINS.ravel()) == tuple(
-    p for first in _CHAIN_FIRST for p in (0, first, first + 1)
-), "the chains must follow MANO's tree"

@@ -33,8 +33,16 @@ ROOT_JOINT: Final = 9
 FINGER_NAMES: Final = ("thumb", "index", "middle", "ring", "little")
 """OpenPose order of the fingers."""
 MANO_FINGER_NAMES: Final = ("index", "middle", "little", "ring", "thumb")
-"""MANO's order of the fingers: skeleton joints 3 f + 1, 3 f + 2, 3 f + 3 belong to finger f."""
-MANO_PARENTS: Final = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
+"""MANO's order of the fingers."""
+FINGER_JOINTS: Final = tuple(tuple(range(4 * f + 1, 4 * f + 5)) for f in range(NUM_FINGERS))
+"""The four key points of each finger, from the palm to the tip; fingers in OpenPose's order."""
+PALM_JOINTS: Final = (WRIST, *(finger[0] for finger in FINGER_JOINTS))
+"""Wrist, thumb base and knuckles: key points that are rigid, whatever the pose."""
+INDEX_KNUCKLE: Final = FINGER_JOINTS[1][0]
+LITTLE_KNUCKLE: Final = FINGER_JOINTS[4][0]
+SKELETON_FINGERS: Final = tuple(tuple(range(3 * f + 1, 3 * f + 4)) for f in range(NUM_FINGERS))
+"""The three skeleton joints of each finger, from the palm outwards; fingers in MANO's order."""
+MANO_PARENTS: Final = (-1, *(parent for chain in SKELETON_FINGERS for parent in (WRIST, *chain[:-1])))
 JOINT_NAMES: Final = (
     "wrist",
     *("thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip"),
@@ -54,7 +62,7 @@ TIP_VERTICES_REGRESSED: Final = (744, 320, 443, 555, 672)
 """Tips (thumb..little) appended to joints regressed from posed vertices."""
 
 BONES: Final = tuple(
-    (WRIST if k == 0 else 4 * f + k, 4 * f + k + 1) for f in range(NUM_FINGERS) for k in range(4)
+    bone for finger in FINGER_JOINTS for bone in zip((WRIST, *finger[:-1]), finger, strict=True)
 )
 """The 20 (parent, child) pairs of key points, finger by finger."""
 

@@ -9,9 +9,10 @@ from functools import cache
 import numpy as np
 
 from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.hand.joint_limits import resting_fingers
 from poem_jax.hand.model import forward_kinematics
 from poem_jax.hand.template import default_hand
-from poem_jax.hand.topology import FINGER_NAMES, MANO_FINGER_NAMES, TIP_VERTICES_LAYER
+from poem_jax.hand.topology import MANO_FINGER_NAMES
 from poem_jax.typing import Array, Float
 
 _THUMB = MANO_FINGER_NAMES.index("thumb")
@@ -29,10 +30,8 @@ _SEGMENT_RADII = np.array([_RADII_MM[name] for name in MANO_FINGER_NAMES]) * (1e
 
 
 @cache
-def rest_fingers() -> Float[np.ndarray, "5 4 3"]:
-    """Joints and tip of each finger of the shipped right hand, MANO's order of fingers, metres."""
-    joints, tips = _rest_skeleton()[1:].reshape(5, 3, 3), _rest_tips()
-    return np.concatenate([joints, tips[:, None]], axis=1)
+def _rest_fingers() -> np.ndarray:
+    return resting_fingers(default_hand())
 
 
 @cache
@@ -41,18 +40,12 @@ def _rest_skeleton() -> np.ndarray:
     return hand.J_regressor.astype(float) @ hand.v_template.astype(float)
 
 
-@cache
-def _rest_tips() -> np.ndarray:
-    numbers = [TIP_VERTICES_LAYER[FINGER_NAMES.index(name)] for name in MANO_FINGER_NAMES]
-    return default_hand().v_template[numbers].astype(float)
-
-
 def posed_fingers(pose: Float[Array, "n 16 3"]) -> Float[np.ndarray, "n 5 4 3"]:
     """Bend the shipped skeleton: joints and tip of every finger, metres."""
     skeleton = _rest_skeleton()
     turns, joints = forward_kinematics(rotation_from_axis_angle(pose), skeleton)
     last = slice(3, None, 3)
-    tips = joints[:, last] + (turns[:, last] * (_rest_tips() - skeleton[last])[:, None, :]).sum(-1)
+    tips = joints[:, last] + (turns[:, last] * (_rest_fingers()[:, -1] - skeleton[last])[:, None, :]).sum(-1)
     return np.concatenate([joints[:, 1:].reshape(-1, 5, 3, 3), tips[:, :, None]], axis=2)
 
 
@@ -75,7 +68,7 @@ def _segments(fingers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _palm_segments() -> tuple[np.ndarray, np.ndarray]:
-    wrist, roots = _rest_skeleton()[0], rest_fingers()[np.arange(5) != _THUMB, 0]
+    wrist, roots = _rest_skeleton()[0], _rest_fingers()[np.arange(5) != _THUMB, 0]
     return wrist + 0.35 * (roots - wrist), wrist + 0.9 * (roots - wrist)
 
 

@@ -9,9 +9,10 @@ from functools import cache
 import numpy as np
 
 from poem_jax.hand.joint_limits import ANGLE_NAMES as ANGLE_NAMES
-from poem_jax.hand.joint_limits import LIMITS_DEG, NUM_BENDING_JOINTS, POSE_LIMITS, axes_of_fingers
+from poem_jax.hand.joint_limits import LIMITS_DEG, NUM_BENDING_JOINTS, POSE_LIMITS, anatomical_axes
+from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import MANO_FINGER_NAMES
-from poem_jax.synthetic.clearance import clearance, posed_fingers, rest_fingers
+from poem_jax.synthetic.clearance import clearance, posed_fingers
 from poem_jax.typing import Array, Float
 
 FAMILIES = ("fist", "pinch", "counting", "flat", "grasp", "random", "point")
@@ -112,7 +113,7 @@ def pose_to_angles(pose: Float[Array, "*batch 16 3"]) -> Float[Array, "*batch 15
 @cache
 def joint_axes() -> Float[np.ndarray, "15 3 3"]:
     """Unit axes (rows flexion, abduction, twist) of each joint of a right hand at rest, orthonormal."""
-    return axes_of_fingers(rest_fingers())
+    return anatomical_axes(default_hand())
 
 
 def _best_candidate(rng: np.random.Generator, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from poem_jax.geometry.transforms import axis_angle_from_rotation
+from poem_jax.geometry.transforms import axis_angle_from_rotation, unit_vectors
 from poem_jax.hand.model import HandModel, hand_mesh
-from poem_jax.hand.topology import NUM_SHAPES, NUM_VERTICES, ROOT_JOINT, WRIST
+from poem_jax.hand.topology import INDEX_KNUCKLE, LITTLE_KNUCKLE, NUM_SHAPES, NUM_VERTICES, ROOT_JOINT, WRIST
 from poem_jax.render.zbuffer import draw_faces, empty_buffers
 from poem_jax.synthetic.config import BodyConfig, LightConfig, OccluderConfig, Range, SyntheticConfig
 from poem_jax.synthetic.poses import sample_pose
@@ -24,7 +24,7 @@ from poem_jax.synthetic.surfaces import (
     unit_sphere,
     wrist_loop,
 )
-from poem_jax.synthetic.viewpoints import unit_vectors
+from poem_jax.synthetic.viewpoints import directions_on_sphere
 from poem_jax.typing import Array, Float, Int
 
 _SHADOW_CELLS = 96
@@ -146,7 +146,7 @@ def build_mesh(
 def draw_light(config: LightConfig, rng: np.random.Generator) -> Light:
     """Draw lights; an automatic exposure, one for all views, makes up for part of their power."""
     count = int(rng.integers(config.num_lights[0], config.num_lights[1] + 1))
-    directions = unit_vectors(*rng.random((2, count + 1)))
+    directions = directions_on_sphere(*rng.random((2, count + 1)))
     tint = 1 + config.tint * rng.uniform(-1, 1, (count + 2, 3))
     colors = rng.uniform(*config.intensity, (count, 1)) * tint[:count] / np.sqrt(count)
     ambient = rng.uniform(*config.ambient, (2, 1)) * tint[count:]
@@ -195,7 +195,7 @@ def _flesh(
         body.joints_world[ROOT_JOINT].astype(np.float64),
         anatomy.arm_faces,
         length=rng.uniform(*config.forearm_length_m),
-        bend=np.radians(rng.uniform(*config.forearm_bend_deg)) * unit_vectors(*rng.random(2)),
+        bend=np.radians(rng.uniform(*config.forearm_bend_deg)) * directions_on_sphere(*rng.random(2)),
         taper=rng.uniform(*config.forearm_taper),
         sleeve=bool(rng.random() < config.sleeve_probability),
     )
@@ -223,7 +223,7 @@ def _draw_objects(
     if chance[0] < config.held_probability:
         objects.append(_held(joints, side, config, rng))
     if chance[1] < config.stray_probability:
-        place = center + rng.uniform(0.1, 0.22) * unit_vectors(*rng.random(2))
+        place = center + rng.uniform(0.1, 0.22) * directions_on_sphere(*rng.random(2))
         objects.append(_draw_object(place, random_rotation(rng), config.half_size_m, rng))
     for camera, draw in zip(cameras_world, chance[2:], strict=True):
         if draw < config.blocker_probability:
@@ -238,7 +238,7 @@ def _held(
     joints: Float[Array, "21 3"], side: float, config: OccluderConfig, rng: np.random.Generator
 ) -> Placed:
     """Put an object before the palm, its long axis across the fingers; `side` is -1 for a left hand."""
-    across = joints[5] - joints[17]
+    across = joints[INDEX_KNUCKLE] - joints[LITTLE_KNUCKLE]
     across /= np.linalg.norm(across)
     forward = joints[ROOT_JOINT] - joints[WRIST]
     out_of_palm = side * np.cross(across, forward)
@@ -263,7 +263,7 @@ def _draw_object(
     half[2] *= stretch
     local = solid.vertices * half
     normals = solid.normals / half
-    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = unit_vectors(normals)
     R = R_world_from_object.T
     color, material = _paint(rng)
     return Placed(Solid(local @ R + place, normals @ R, solid.faces), local, color, material)

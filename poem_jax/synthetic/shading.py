@@ -13,6 +13,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
+from poem_jax.geometry.cameras import MIN_DEPTH
 from poem_jax.render.zbuffer import corner_weights
 
 NUM_ATTRIBUTES = 13
@@ -56,7 +57,7 @@ def project_points(K, T_cam_from_world, points_world, scale, points_px):
     for i in range(points_world.shape[0]):
         x, y, z = points_world[i, 0], points_world[i, 1], points_world[i, 2]
         depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        safe = depth if depth > 1e-6 else 1e-6
+        safe = depth if depth > MIN_DEPTH else MIN_DEPTH
         points_px[i, 0] = fx * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / safe + cx
         points_px[i, 1] = fy * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / safe + cy
         points_px[i, 2] = depth

@@ -9,7 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from poem_jax.hand.model import HandModel, hand_mesh
-from poem_jax.hand.topology import NUM_FINGERS, NUM_SHAPES, NUM_SKELETON_JOINTS, ROOT_JOINT, WRIST
+from poem_jax.hand.topology import (
+    FINGER_JOINTS,
+    INDEX_KNUCKLE,
+    LITTLE_KNUCKLE,
+    NUM_FINGERS,
+    NUM_SHAPES,
+    NUM_SKELETON_JOINTS,
+    ROOT_JOINT,
+    WRIST,
+)
 from poem_jax.typing import Array, Float
 
 _TONES_SRGB = np.array(
@@ -39,7 +48,7 @@ def map_skin(hand: HandModel, normals: Float[Array, "vert 3"]) -> SkinMap:
     dorsal, radial = _palm_axes(joints, bool(hand.is_left))
     nail, crease, red = np.zeros(len(rest)), np.zeros(len(rest)), np.zeros(len(rest))
     for finger in range(NUM_FINGERS):
-        chain = joints[4 * finger + 1 : 4 * finger + 5]
+        chain = joints[list(FINGER_JOINTS[finger])]
         # A thumb nail faces half-way between the back of the hand and its radial side.
         up = dorsal + 0.9 * radial if finger == 0 else dorsal
         nail = np.maximum(nail, _nail(rest, normals, chain[2], chain[3], up))
@@ -92,7 +101,7 @@ def _nail_color(rng: np.random.Generator, tone: Float[Array, "3"]) -> Float[Arra
 
 def _palm_axes(joints: Float[Array, "21 3"], is_left: bool) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Return unit vectors to the back of the hand and to the thumb's side of the palm."""
-    index, middle, little = joints[5], joints[ROOT_JOINT], joints[17]
+    index, middle, little = joints[INDEX_KNUCKLE], joints[ROOT_JOINT], joints[LITTLE_KNUCKLE]
     radial = index - little
     radial /= np.linalg.norm(radial)
     # A right hand with its palm down and fingers pointing away has the thumb on its left.

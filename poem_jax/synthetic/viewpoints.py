@@ -10,7 +10,7 @@ import numpy as np
 
 from poem_jax.data.transforms import jitter_box, square_box
 from poem_jax.geometry.cameras import crop_intrinsics, project
-from poem_jax.geometry.transforms import rigid, rotation_about_z, skew_matrix
+from poem_jax.geometry.transforms import rigid, rotation_about_z, smallest_rotation, unit_vectors
 from poem_jax.synthetic.config import CameraConfig, CropConfig, Range
 from poem_jax.typing import Array, Float, Int
 
@@ -46,12 +46,12 @@ def draw_viewpoints(
     frame_wh = np.array(cameras.frames_wh)[(numbers[:, 0] * len(cameras.frames_wh)).astype(int)]
     K = _intrinsics(cameras, numbers[:, 1:6], frame_wh)
     target_world = joints_world.mean(0)
-    direction = unit_vectors(numbers[:, 6], numbers[:, 7])
+    direction = directions_on_sphere(numbers[:, 6], numbers[:, 7])
     camera_world = target_world + direction * within(cameras.distance_m, numbers[:, 8])[:, None]
     seen_at = frame_wh / 2 * (1 + cameras.aim_jitter * (2 * numbers[:, 9:11] - 1))
     roll = np.radians(within(cameras.roll_deg, numbers[:, 11]))
     R = _look_along(-direction, roll)
-    R = _turn_z_to(_rays(K, seen_at)) @ R
+    R = smallest_rotation(np.array([0.0, 0.0, 1.0]), _rays(K, seen_at)) @ R
     T = rigid(R, -np.einsum("vij,vj->vi", R, camera_world))
     keypoints_px = project(K, T, np.broadcast_to(joints_world, (num_views, *joints_world.shape)))[0]
     box = square_box(keypoints_px, crop.expand_ratio)
@@ -65,7 +65,7 @@ def within(bounds: Range, uniform: Float[Array, "*batch"]) -> Float[Array, "*bat
     return bounds[0] + (bounds[1] - bounds[0]) * uniform
 
 
-def unit_vectors(u: Float[Array, "*batch"], v: Float[Array, "*batch"]) -> Float[Array, "*batch 3"]:
+def directions_on_sphere(u: Float[Array, "*batch"], v: Float[Array, "*batch"]) -> Float[Array, "*batch 3"]:
     """Map two uniform numbers to a direction uniform on the sphere (Archimedes: its height is uniform)."""
     height, angle = 2 * np.asarray(u) - 1, 2 * np.pi * np.asarray(v)
     radius = np.sqrt(np.maximum(1 - height**2, 0))
@@ -96,21 +96,13 @@ def _intrinsics(
 def _look_along(forward: Float[Array, "view 3"], roll: Float[Array, "view"]) -> Float[Array, "view 3 3"]:
     """Return R_cam_from_world of cameras whose z axis is `forward`, turned about it by `roll`."""
     aside = np.where(np.abs(forward[:, :1]) < 0.8, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    x = np.cross(aside, forward)
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    x = unit_vectors(np.cross(aside, forward))
     return rotation_about_z(roll) @ np.stack([x, np.cross(forward, x), forward], axis=-2)
 
 
 def _rays(K: Float[Array, "view 3 3"], uv_px: Float[Array, "view 2"]) -> Float[Array, "view 3"]:
     focal = np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
-    rays = np.concatenate([(uv_px - K[:, :2, 2]) / focal, np.ones((len(K), 1))], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def _turn_z_to(ray: Float[Array, "view 3"]) -> Float[Array, "view 3 3"]:
-    """Return the smallest rotation that turns the z axis to `ray` (which points forward)."""
-    cross = skew_matrix(np.cross([0.0, 0.0, 1.0], ray))
-    return np.eye(3) + cross + cross @ cross / (1 + ray[:, 2])[:, None, None]
+    return np.concatenate([(uv_px - K[:, :2, 2]) / focal, np.ones((len(K), 1))], axis=-1)
 
 
 def _frame(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from poem_jax.geometry.cameras import project
+from poem_jax.geometry.transforms import unit_vectors
 from poem_jax.io.atomic import whole_file
 from poem_jax.typing import Array, Float, Int, UInt8
 
@@ -81,7 +82,7 @@ def initial_view(points_world: Float[Array, "point 3"], T_cam_from_world: Float[
     up = -R_world_from_cam[:, :, 1].mean(0)
     if np.linalg.norm(up) < 0.1:
         up = -R_world_from_cam[0, :, 1]
-    up = _unit(up)
+    up = unit_vectors(up)
     distance = 3.0 * radius / np.tan(_FIELD_OF_VIEW / 2)
     views = [
         View(centre + distance * direction, centre, up, float(_FIELD_OF_VIEW))
@@ -92,9 +93,9 @@ def initial_view(points_world: Float[Array, "point 3"], T_cam_from_world: Float[
 
 def _directions(up: Float[Array, "3"]) -> Float[Array, "candidate 3"]:
     """Directions around `up`, a little above its equator."""
-    ahead = _unit(np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.8 else [0, 1.0, 0]))
+    ahead = unit_vectors(np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.8 else [0, 1.0, 0]))
     turns = np.linspace(0, 2 * np.pi, _CANDIDATE_VIEWS, endpoint=False)[:, None]
-    return _unit(np.cos(turns) * ahead + np.sin(turns) * np.cross(up, ahead) + 0.35 * up)
+    return unit_vectors(np.cos(turns) * ahead + np.sin(turns) * np.cross(up, ahead) + 0.35 * up)
 
 
 def _merit(view: View, positions: Float[Array, "view 3"]) -> float:
@@ -102,7 +103,8 @@ def _merit(view: View, positions: Float[Array, "view 3"]) -> float:
     K, T_eye_from_world = view_camera(view, (3, 4))
     uv, depth = project(K, T_eye_from_world, positions)
     in_sight = (depth > 0) & (uv > 0).all(-1) & (uv < [4, 3]).all(-1)
-    nearest = float((_unit(positions - view.look_at) @ _unit(view.position - view.look_at)).max())
+    to_cameras, to_eye = unit_vectors(positions - view.look_at), unit_vectors(view.position - view.look_at)
+    nearest = float((to_cameras @ to_eye).max())
     hidden = nearest > np.cos(_CLEAR_ANGLE)
     return float(in_sight.sum()) - nearest / 10 - (len(positions) + 1) * hidden
 
@@ -112,8 +114,8 @@ def view_camera(view: View, hw: tuple[int, int]) -> tuple[Float[Array, "3 3"], F
     height, width = hw
     focal = height / 2 / np.tan(view.fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    z = _unit(view.look_at - view.position)
-    x = _unit(np.cross(z, view.up))
+    z = unit_vectors(view.look_at - view.position)
+    x = unit_vectors(np.cross(z, view.up))
     R_cam_from_world = np.stack([x, np.cross(z, x), z])
     T_cam_from_world = np.eye(4)
     T_cam_from_world[:3, :3] = R_cam_from_world
@@ -257,7 +259,3 @@ def _first_points(frames: Sequence[PageFrame]) -> Array:
         if frame.hands:
             return np.concatenate([np.asarray(vertices) for vertices in frame.hands.values()])
     raise ValueError("no frame holds a hand: pass `view` to say where the page should look")
-
-
-def _unit(vector: Array) -> Array:
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)

@@ -14,9 +14,11 @@ from poem_jax.fitting.adam import (
     RELEASE_DIAGONAL_PX,
     AdamParameters,
     AdamRecipe,
+    Plateau,
     adam_fit,
     fitting_loss,
     released_start,
+    wait_or_halve,
 )
 from poem_jax.fitting.anatomy_loss import axis_angle_from_raw_quaternion
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model, rest_wrist
@@ -28,6 +30,8 @@ from poem_jax.hand.model import hand_mesh
 from poem_jax.render.zbuffer import NO_FACE, rasterise
 from tests.fitting.observed import observed
 
+HALVED = 246
+"""The first step of the stored run with halved rates."""
 STATES = {"quaternions": "hand_pose", "shape": "hand_shape", "translation": "hand_tsl"}
 
 
@@ -54,6 +58,35 @@ def stored(shared_dir) -> Stored:
     return Stored(golden, keypoint_model(load(folder / "fake_mano.npz")), seen)
 
 
+def rates_of(losses, recipe: AdamRecipe) -> np.ndarray:
+    """Return the step sizes before every step: `ReduceLROnPlateau` of PyTorch, relative threshold."""
+    rates, best, waited, history = np.array([recipe.rate, recipe.shape_rate, recipe.rate]), np.inf, 0, []
+    for loss in np.asarray(losses):
+        history.append(rates)
+        best, waited = (loss, 0) if loss < best * (1 - recipe.threshold) else (best, waited + 1)
+        if waited > recipe.patience:
+            rates, waited = np.maximum(rates / 2, recipe.min_rate), 0
+    return np.array(history)
+
+
+@pytest.mark.parity
+def test_the_released_rates_are_halved_once(stored):
+    """All 300 stored step sizes, from when the loss improved.
+
+    Where a run meets its best loss decides where it halves its rates, and runs part after step 75 (below).
+    The stored one halves before step 246: its best until then was that of step 194; a better one followed.
+    """
+    falling, waiting = np.linspace(2, 1, HALVED - 51), np.ones(51)
+    losses = np.concatenate([falling, waiting, np.linspace(0.9, 0.5, 300 - HALVED)])
+
+    def step(plateau, loss):
+        return wait_or_halve(plateau, loss, ADAM_300_RELEASE), plateau.rates
+
+    begin = Plateau(jnp.asarray([1e-2, 1e-3, 1e-2]), jnp.asarray(jnp.inf), jnp.asarray(0))
+    _, rates = jax.lax.scan(step, begin, jnp.asarray(losses, jnp.float32))
+    np.testing.assert_allclose(rates, stored.golden["lr"], rtol=1e-6)
+
+
 @pytest.mark.parity
 def test_the_released_recipe_follows_the_release(stored):
     """Losses to step 70 and states to step 50 within 1e-3.
@@ -69,7 +102,8 @@ def test_the_released_recipe_follows_the_release(stored):
     _, trace = run(stored.model, stored.seen, released_start(jnp.asarray(noise, jnp.float32)))
     assert float(trace.keypoint_loss[0]) == pytest.approx(0.14027, abs=1e-5)
     np.testing.assert_allclose(trace.keypoint_loss[:70], golden["reprojection_loss"][:70], rtol=1e-3)
-    np.testing.assert_allclose(trace.rates[:246], golden["lr"][:246], rtol=1e-6)
+    np.testing.assert_allclose(trace.rates[:HALVED], golden["lr"][:HALVED], rtol=1e-6)
+    np.testing.assert_allclose(trace.rates, rates_of(trace.loss, ADAM_300_RELEASE), rtol=1e-6)
     for step in (1, 2, 5, 10, 20, 50):
         for ours, theirs in STATES.items():
             state = np.ravel(getattr(trace.parameters, ours)[step - 1])

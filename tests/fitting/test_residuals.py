@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from poem_jax.fitting import Observations, anatomy_loss, residuals
-from poem_jax.fitting.kinematics import keypoint_model, pose_keypoints, pose_keypoints_of_rotations
+from poem_jax.fitting.kinematics import (
+    keypoint_model,
+    pose_keypoints,
+    pose_keypoints_of_rotations,
+)
 from poem_jax.hand.joint_limits import POSE_LIMITS
 from poem_jax.hand.mano_file import load
 from poem_jax.hand.model import HandModel
@@ -160,13 +164,27 @@ def test_anatomy_gradients(model64, rng):
 
 @pytest.mark.parity
 def test_anatomy_is_the_release(shared_dir):
-    # Tests in float32 that ran before leave index arrays converted for their precision in JAX's caches.
-    jax.clear_caches()
+    """Joints, the three axes of every bone, axis and angle of every turn, and the six terms of four poses."""
     folder = shared_dir / "reference" / "poem_v1"
-    golden = np.load(folder / "golden_fit.npz")
+    golden = {name: array.astype(float) for name, array in np.load(folder / "golden_fit.npz").items()}
     hand = load(folder / "fake_mano.npz")
     model = keypoint_model(HandModel(*(a.astype(float) if a.dtype.kind == "f" else a for a in hand)))
+    quaternions, shape = golden["anat/pose"].reshape(4, 16, 4), golden["anat/shape"]
+    rotations = anatomy_loss.rotations_from_raw_quaternions(quaternions)
+    posed = pose_keypoints_of_rotations(model, rotations, shape)
+    axes = anatomy_loss.bone_axes(posed.rotations, posed.points)
+    turns = anatomy_loss.axis_angle_from_raw_quaternion(quaternions)[:, 1:]
+    axis, angle = anatomy_loss.axis_and_angle(turns)
+    found = {
+        "joints": posed.points,
+        "b_axis": axes.b,
+        "u_axis": axes.u,
+        "l_axis": axes.l,
+        "axis": axis,
+        "angle": angle,
+    }
+    for name, array in found.items():
+        np.testing.assert_allclose(array, golden[f"anat/{name}"], rtol=1e-5, atol=2e-6, err_msg=name)
+    terms = anatomy_of(model, quaternions, shape)
     for i in range(4):
-        quaternions = golden["anat/pose"][i].reshape(16, 4).astype(float)
-        terms = anatomy_of(model, quaternions, golden["anat/shape"][i].astype(float))
-        np.testing.assert_allclose(terms, golden[f"anat/terms_{i}"], rtol=1e-5)
+        np.testing.assert_allclose([term[i] for term in terms], golden[f"anat/terms_{i}"], rtol=1e-5)

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.hand.joint_limits import resting_fingers
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import BONES, SKELETON_JOINT_NAMES
-from poem_jax.synthetic.clearance import clearance, posed_fingers, rest_fingers, segment_distance
+from poem_jax.synthetic.clearance import clearance, posed_fingers, segment_distance
 from poem_jax.synthetic.poses import (
     ANGLE_NAMES,
     FAMILIES,
@@ -71,7 +72,7 @@ def test_angles_are_components_of_the_pose(rng):
 
 
 def test_flexion_bends_into_the_palm_and_abduction_towards_the_thumb():
-    hand, rest = default_hand(), rest_fingers()
+    hand, rest = default_hand(), resting_fingers(default_hand())
     for f, name in enumerate(("index", "middle", "little", "ring", "thumb")):
         for axis, direction in ((0, [0, -1.0, 0]), (1, [0, 0, 1.0])):
             if name == "thumb" and axis == 1:
@@ -166,7 +167,7 @@ def test_capsule_skeleton_is_the_hands(rng):
 
 
 def test_clearance_sees_a_finger_in_another():
-    rest = rest_fingers()[None]
+    rest = resting_fingers(default_hand())[None]
     assert clearance(rest)[0] > 0
     crossed = rest.copy()
     crossed[0, 0] = crossed[0, 1] + np.array([0, 0, 0.004])

@@ -1,0 +1,26 @@
+"""What the products of a traced program are computed in."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def products(jaxpr: Any) -> Iterator[Any]:
+    """Yield the matrix products of a program, those of its loops and functions included."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation
+        for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns")):
+            if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
+                yield from products(getattr(inner, "jaxpr", inner))
+
+
+def coarse_products(function: Callable, *args: Any) -> list[str]:
+    """Return the float products that an accelerator would compute in fewer bits than float32 has."""
+    found = list(products(jax.make_jaxpr(function)(*args).jaxpr))
+    assert found, "a test of products must see some"
+    full = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
+    floats = (e for e in found if jnp.issubdtype(e.outvars[0].aval.dtype, jnp.floating))
+    return [str(e.source_info.traceback) for e in floats if e.params["precision"] != full]
