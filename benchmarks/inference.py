@@ -169,7 +169,7 @@ def measure_machine() -> dict:
     """Return the device, and how fast it multiplies float32 matrices."""
     import jax
 
-    from poem_jax.models.inference import _cores
+    from poem_jax.models.infer import _cores
 
     a = jax.random.normal(jax.random.key(0), (PRODUCT_SIZE, PRODUCT_SIZE))
     product = jax.jit(lambda x: jax.numpy.matmul(x, x, precision="highest"))
@@ -228,7 +228,7 @@ def measure_gpu(preset: str, half: bool) -> dict:
     """Return milliseconds a frame at batch 1 and frames a second at the best batch, 8 views each."""
     import jax
 
-    from poem_jax.models.inference import infer, prepare
+    from poem_jax.models.infer import infer, prepare
 
     config, params = _model(preset)
     if half:
@@ -253,7 +253,7 @@ def _whole_calls(params, config, case: list[int], forms: tuple[str, ...]) -> dic
     """Return calls of the wanted forms on one batch; `case` = views per sample."""
     import jax
 
-    from poem_jax.models.inference import infer, prepare
+    from poem_jax.models.infer import infer, prepare
 
     images, cams, root = _scene(config, case)
     calls: dict[str, Callable] = {}
@@ -272,12 +272,12 @@ def _part_calls(params, config, views: int) -> dict[str, dict[str, Callable]]:
     import jax
     import jax.numpy as jnp
 
-    from poem_jax.models import inference
-    from poem_jax.models.primary_frame import enter_primary_frame
+    from poem_jax.models import infer as inference
+    from poem_jax.models.world_frame import enter_working_frame
 
     on_cpu = jax.default_backend() == "cpu"
     images, cams, root = _scene(config, [views])
-    frame = jax.tree.map(jnp.asarray, enter_primary_frame(cams, root))
+    frame = jax.tree.map(jnp.asarray, enter_working_frame(images, cams, root, "float32"))
     prepared, held = inference.prepare(params, config), jax.device_put(params)
     plain = {
         name: _plain_program(f"plain_{name}", config)
@@ -289,9 +289,9 @@ def _part_calls(params, config, views: int) -> dict[str, dict[str, Callable]]:
     levels = plain["trunk"](held, normal)
     by_view = [jax.tree.map(lambda x, i=i: x[i : i + chunk], levels) for i in range(0, views, chunk)]
     maps = plain["features"](held, levels)[None]
-    tokens = plain["sampling_and_aggregation"](held, maps, frame.cams, frame.root)
+    tokens = plain["sampling_and_aggregation"](held, maps, frame.cams, frame.known_root)
     start = params["constants"]["template_queries"][None] / config.basis.radius
-    inputs = (maps, frame.cams, frame.root)
+    inputs = (maps, frame.cams, frame.known_root)
     plain_calls = (
         lambda: plain["trunk"](held, normal),
         lambda: (plain["heat_maps"](held, levels), plain["features"](held, levels)),
@@ -315,10 +315,8 @@ def _jitted(part: Callable) -> Callable:
 
 
 def _trunk(prepared, images):
-    from poem_jax.models.poem import normalised_images
-
-    dtype = prepared.params["constants"]["basis_points"].dtype
-    return _module(prepared).trunk(normalised_images(images, prepared.config, dtype), _mode())
+    model = _module(prepared)
+    return model.trunk(model._normalised(images), _mode())
 
 
 def _branches(prepared, levels):
@@ -337,13 +335,13 @@ def _decode(prepared, inputs):
 
 
 def _module(prepared):
-    from poem_jax.models import parameters
+    from poem_jax.models.network import assemble
 
-    return parameters.assemble(prepared.config, prepared.params)
+    return assemble(prepared.config, prepared.params)
 
 
 def _mode():
-    from poem_jax.models.batch_norm import NormMode
+    from poem_jax.models.layers import NormMode
 
     return NormMode()
 
@@ -363,9 +361,9 @@ def _model(preset: str):
     import poem_jax
     from poem_jax.geometry.neighbours import farthest_points
     from poem_jax.hand.template import default_hand
-    from poem_jax.models.basis import basis_points
-    from poem_jax.models.parameters import describe
-    from poem_jax.models.reconstruction import template_queries
+    from poem_jax.models.hand_output import template_queries
+    from poem_jax.models.network import describe
+    from poem_jax.models.point_features import basis_points
 
     config, rng = poem_jax.preset(preset), np.random.default_rng(0)
     shapes = describe(config)

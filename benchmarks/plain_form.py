@@ -21,14 +21,13 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from poem_jax.geometry.cameras import Cameras, project
+from poem_jax.geometry.cameras import Cameras, anchor_to_primary, project
 from poem_jax.geometry.neighbours import gather
 from poem_jax.geometry.sampling import sample_bilinear
-from poem_jax.geometry.transforms import rotation_from_6d, transform_points
+from poem_jax.geometry.transforms import invert_rigid, rotation_from_6d, transform_points
 from poem_jax.geometry.triangulation import triangulate
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, ROOT_JOINT, join_queries, split_queries
-from poem_jax.models.batch_norm import EPSILON
 from poem_jax.models.config import (
     AttentionKeys,
     BehindCamera,
@@ -50,9 +49,8 @@ from poem_jax.models.config import (
     VectorForm,
     ViewWeights,
 )
-from poem_jax.models.parametric import HandParameters, root_relative_mesh
-from poem_jax.models.primary_frame import enter_primary_frame
-from poem_jax.models.query_start import pose_by_joints
+from poem_jax.models.hand_output import HandParameters, pose_by_joints, root_relative_mesh
+from poem_jax.models.layers import BATCH_NORM_EPSILON
 from poem_jax.typing import Array, Bool, Float, Int, Num, Params
 
 _TEMPERATURE = 10000.0
@@ -66,7 +64,7 @@ IndexSets = list[Int[Array, "batch query k"]]
 class PlainResult(NamedTuple):
     """What `poem_jax.forward` predicts, as far as it comes from the network; frames and units as there."""
 
-    layers: Float[Array, "layer batch query 3"]
+    layers: Float[Array, "batch layer query 3"]
     """World, metres, in the order of the config."""
     keypoints_px: Float[Array, "batch view joint 2"]
     heat_maps: Float[Array, "batch view joint h w"]
@@ -82,7 +80,7 @@ def plain_forward(
     root: Float[Array, "batch 3"] | None = None,
     neighbours: IndexSets | None = None,
 ) -> tuple[PlainResult, IndexSets]:
-    """Compute what `poem_jax.models.poem.forward` does at inference for views that are all valid.
+    """Compute what `poem_jax.models.network.forward` does at inference for views that are all valid.
 
     Args:
         params: as there.
@@ -94,19 +92,23 @@ def plain_forward(
 
     Returns: the result, and the index sets that were used.
     """
-    frame = enter_primary_frame(Cameras(cams.K, cams.T_cam_from_world), root)
+    everything = jnp.ones(cams.K.shape[:2], bool)
+    T_cam_from_primary, T_primary_from_world = anchor_to_primary(cams.T_cam_from_world, everything)
+    cams = Cameras(cams.K, T_cam_from_primary)
+    if root is not None:
+        root = transform_points(T_primary_from_world, root[:, None])[:, 0]
     keypoints_px, heat_maps, maps = plain_views(params, images, config)
-    joints, solved = _triangulated(keypoints_px, heat_maps, frame.cams, config)
-    centre = _root(joints, solved, frame.root)
+    joints, solved = _triangulated(keypoints_px, heat_maps, cams, config)
+    centre = _root(joints, solved, root)
 
-    tokens = plain_sampling_and_aggregation(params, maps, frame.cams, centre, config)
+    tokens = plain_sampling_and_aggregation(params, maps, cams, centre, config)
     start = plain_start(params, joints - centre[:, None], solved, config)
     moved, embeddings, found = plain_decoder(params, start, tokens, config, neighbours)
     layers = [config.basis.radius * queries for queries in moved]
     if config.decoder.output is DecoderOutput.HAND_PARAMETERS:
         layers.append(plain_hand(params, embeddings, config))
-    to_world = frame.T_world_from_primary
-    layers_world = transform_points(to_world, jnp.stack(layers) + centre[:, None])
+    to_world = invert_rigid(T_primary_from_world)
+    layers_world = transform_points(to_world[:, None], jnp.stack(layers, 1) + centre[:, None, None])
     root_world = transform_points(to_world, centre[:, None])[:, 0]
     return PlainResult(layers_world, keypoints_px, heat_maps, root_world), found
 
@@ -215,7 +217,7 @@ def _residual(x: Array, w: Weights, stride: int = 1) -> Array:
 
 def _conv_norm(x: Array, w: Weights, *, stride: int = 1, relu: bool = True) -> Array:
     y, norm = _conv(x, w["conv"], stride), w["norm"]
-    y = (y - norm["mean"]) / jnp.sqrt(norm["variance"] + EPSILON) * norm["scale"] + norm["bias"]
+    y = (y - norm["mean"]) / jnp.sqrt(norm["variance"] + BATCH_NORM_EPSILON) * norm["scale"] + norm["bias"]
     return jax.nn.relu(y) if relu else y
 
 

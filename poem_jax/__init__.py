@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from poem_jax.batch import MultiViewBatch, Prediction
     from poem_jax.geometry.cameras import Cameras
     from poem_jax.hand.model import HandModel
-    from poem_jax.models.inference import Prepared, infer, prepare
-    from poem_jax.models.poem import apply, init, preset
+    from poem_jax.models.apply import apply, init
+    from poem_jax.models.infer import Prepared, infer, prepare
+    from poem_jax.models.presets import preset
     from poem_jax.weights.store import load, save
 
 _HOME = {
@@ -19,13 +20,13 @@ _HOME = {
     "HandModel": "poem_jax.hand.model",
     "MultiViewBatch": "poem_jax.batch",
     "Prediction": "poem_jax.batch",
-    "Prepared": "poem_jax.models.inference",
-    "apply": "poem_jax.models.poem",
-    "infer": "poem_jax.models.inference",
-    "init": "poem_jax.models.poem",
+    "Prepared": "poem_jax.models.infer",
+    "apply": "poem_jax.models.apply",
+    "infer": "poem_jax.models.infer",
+    "init": "poem_jax.models.apply",
     "load": "poem_jax.weights.store",
-    "prepare": "poem_jax.models.inference",
-    "preset": "poem_jax.models.poem",
+    "prepare": "poem_jax.models.infer",
+    "preset": "poem_jax.models.presets",
     "save": "poem_jax.weights.store",
 }
 _ROOMS = (

@@ -37,7 +37,7 @@ class Prediction(NamedTuple):
     """The point about which the second stage worked: triangulated, or as given."""
     keypoints_px: Float[Array, "batch view joint 2"]
     """Heat-map coordinates per view; one joint (the root) in the paper, 21 in the release."""
-    layers_world: Float[Array, "layer batch 799 3"]
+    layers_world: Float[Array, "batch layer 799 3"]
     """Query points after every decoder layer, in the preset's own query order."""
     valid: Bool[Array, " batch"]
     """False where the sample could not be solved (no valid view, or one view and no root)."""

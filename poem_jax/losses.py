@@ -255,8 +255,8 @@ def _supervised(prediction: Prediction, layers: Layers, query_order: QueryOrder)
     last = _Points(prediction.joints_world, prediction.vertices_world)
     if layers is Layers.LAST:
         return [last]
-    vertices, joints = split_queries(prediction.layers_world[:-1], query_order)
-    return [_Points(joints[i], vertices[i]) for i in range(vertices.shape[0])] + [last]
+    vertices, joints = split_queries(prediction.layers_world[:, :-1], query_order)
+    return [_Points(joints[:, i], vertices[:, i]) for i in range(vertices.shape[1])] + [last]
 
 
 def _point_terms(

@@ -46,8 +46,8 @@ def micro_model():
     """Config and parameters of a model that compiles in seconds and has learned nothing."""
     import jax
 
+    from poem_jax.models.apply import init
     from poem_jax.models.config import BasisConfig, Config, DecoderConfig, ResNetConfig, Stem
-    from poem_jax.models.poem import init
 
     config = Config(
         image_hw=(64, 64),

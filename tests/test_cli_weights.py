@@ -27,8 +27,8 @@ from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.io.torch_file import load_state_dict, save_state_dict
 from poem_jax.models.config import Config, HRNetConfig
+from poem_jax.models.hand_output import template_queries
 from poem_jax.models.presets import PRESETS
-from poem_jax.models.reconstruction import template_queries
 from poem_jax.typing import Params
 from poem_jax.weights.release_files import read_assets
 from poem_jax.weights.release_keys import dead_shapes, hand_prefixes, live_entries

@@ -68,11 +68,11 @@ def random_case(views=3, batch=2, joints=1, seed=0) -> tuple[Prediction, MultiVi
         T[b, v, :3, 3] = [0, 0, 0.8]
     K = np.tile(np.array([[150, 0, 48], [0, 150, 64], [0, 0, 1]], np.float32), (batch, views, 1, 1))
     true_joints, true_vertices = 0.05 * normal(batch, 21, 3), 0.05 * normal(batch, 778, 3)
-    layers = 0.05 * normal(3, batch, 799, 3)
+    layers = 0.05 * normal(batch, 3, 799, 3)
     prediction = Prediction(
-        vertices_world=layers[-1, :, :778],
-        joints_world=layers[-1, :, 778:],
-        root_world=layers[-1, :, 778 + 9],
+        vertices_world=layers[:, -1, :778],
+        joints_world=layers[:, -1, 778:],
+        root_world=layers[:, -1, 778 + 9],
         keypoints_px=50 + 10 * normal(batch, views, joints, 2),
         layers_world=layers,
         valid=np.ones(batch, bool),
@@ -97,8 +97,8 @@ def naive_release(prediction, batch, hand, layers, joint_power=2):
     diagonal = np.hypot(*HW)
     uv_true = batch.keypoints_px[:, :, 9:10] if prediction.keypoints_px.shape[2] == 1 else batch.keypoints_px
     total = 10 * np.mean(np.sum(((prediction.keypoints_px - uv_true) / diagonal) ** 2, -1))
-    for layer in layers:
-        vertices, joints = layer[:, :778], layer[:, 778:]
+    for i in range(layers.shape[1]):
+        vertices, joints = layers[:, i, :778], layers[:, i, 778:]
         squares, regressed, absolute, pixels = [], [], [], []
         for b in range(len(joints)):
             R = batch.cameras.T_cam_from_world[b, 0, :3, :3]
@@ -120,7 +120,7 @@ def naive_release(prediction, batch, hand, layers, joint_power=2):
 def test_release_and_paper_agree_with_naive_loops(hand, joints):
     prediction, batch = random_case(joints=joints)
     prediction = prediction._replace(pose=None, shape=None)
-    for recipe, layers in ((RELEASE, prediction.layers_world[-1:]), (PAPER, prediction.layers_world)):
+    for recipe, layers in ((RELEASE, prediction.layers_world[:, -1:]), (PAPER, prediction.layers_world)):
         loss, _ = multi_view_losses(prediction, batch, hand=hand, image_hw=HW, recipe=recipe)
         np.testing.assert_allclose(loss, naive_release(prediction, batch, hand, layers), rtol=1e-5)
 
@@ -208,9 +208,8 @@ def pad(prediction, batch, junk):
     mask = np.pad(mask, ((0, 1), (0, 1)))
     mask[-1] = True
     batch = batch._replace(cameras=Cameras(K, T, mask), sample_mask=np.append(batch.sample_mask, False))
-    fields = ("vertices_world", "joints_world", "root_world", "keypoints_px", "pose", "shape")
+    fields = ("vertices_world", "joints_world", "root_world", "keypoints_px", "layers_world", "pose", "shape")
     prediction = grown_all(grown_all(prediction, 1, ("keypoints_px",)), 0, fields)
-    prediction = grown_all(prediction, 1, ("layers_world",))
     return prediction._replace(valid=np.append(prediction.valid, True)), batch
 
 
@@ -242,8 +241,7 @@ def test_padding_changes_neither_losses_nor_gradients(hand, junk):
 def test_unsolved_samples_do_not_count_in_3d(hand):
     prediction, batch = random_case()
     alone = jax.tree.map(lambda x: x[:1], batch)
-    first = jax.tree.map(lambda x: x[:1], prediction._replace(layers_world=None))
-    first = first._replace(layers_world=prediction.layers_world[:, :1])
+    first = jax.tree.map(lambda x: x[:1], prediction)
     recipe = replace(RELEASE, keypoints=0.0)
     options = {"hand": hand, "image_hw": HW, "recipe": recipe}
     masked = prediction._replace(valid=np.array([True, False]))
@@ -320,7 +318,7 @@ def released_case(folder: Path, name: str) -> tuple[Prediction, MultiViewBatch, 
         joints_world=golden["pred_joints_3d"],
         root_world=golden["pred_joints_3d"][:, 9],
         keypoints_px=golden["pred_joints_uv"][index],
-        layers_world=golden["all_coords_preds"],
+        layers_world=np.moveaxis(golden["all_coords_preds"], 0, 1),
         valid=np.ones(batch, bool),
         **parametric,
     )

@@ -29,7 +29,7 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.hand.model import mirror_pose
 from poem_jax.models.config import Config
-from poem_jax.models.inference import Prepared, prepare, run_packed
+from poem_jax.models.infer import Prepared, infer_unchecked, prepare
 from poem_jax.typing import Array, Int, Params
 from poem_jax.weights import store
 
@@ -47,7 +47,7 @@ class Network(NamedTuple):
     prepared: Prepared
     origin: str = "given"
     """Where the weights came from, for the report."""
-    predict: Callable[[Prepared, Array, Cameras], Prediction] = run_packed
+    predict: Callable[[Prepared, Array, Cameras], Prediction] = infer_unchecked
 
     def faces(self) -> dict[str, Int[Array, "face 3"]]:
         """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""

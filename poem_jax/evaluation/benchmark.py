@@ -21,7 +21,7 @@ from poem_jax.evaluation.protocols import MM_PER_METRE, find_protocol
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
-from poem_jax.models import poem
+from poem_jax.models.apply import apply
 from poem_jax.models.config import Config
 from poem_jax.typing import Array, Params
 
@@ -166,14 +166,14 @@ def _batches(captures: Captures, settings: BenchmarkSettings) -> Iterator[MultiV
 def _reconstruct(
     params: Params, views: Array, cams: Cameras, root_true: Array, *, config: Config
 ) -> Reconstructions:
-    found = poem.apply(params, views, cams, config=config)
-    return Reconstructions(found, poem.apply(params, views, cams, config=config, root_world=root_true))
+    found = apply(params, views, cams, config=config)
+    return Reconstructions(found, apply(params, views, cams, config=config, root_world=root_true))
 
 
 def _reconstruct_given(
     params: Params, views: Array, cams: Cameras, root_true: Array, *, config: Config
 ) -> Reconstructions:
-    given = poem.apply(params, views, cams, config=config, root_world=root_true)
+    given = apply(params, views, cams, config=config, root_world=root_true)
     return Reconstructions(given, given)
 
 

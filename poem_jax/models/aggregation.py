@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.models.config import AggregationConfig, Layout, Similarity, SingleView
-from poem_jax.models.linear import Linear
+from poem_jax.models.layers import linear
 from poem_jax.typing import Array, Bool, Float, Int
 
 _POINTS_AT_A_TIME = 512
@@ -25,9 +25,9 @@ class ProjectiveAggregation(nnx.Module):
     def __init__(self, config: AggregationConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.config = config
         half = width // 2
-        self.theta_in, self.theta_out = Linear(width, width, rngs=rngs), Linear(width, half, rngs=rngs)
+        self.theta_in, self.theta_out = linear(width, width, rngs=rngs), linear(width, half, rngs=rngs)
         hidden = half if config.narrow_phi else width
-        self.phi_in, self.phi_out = Linear(half, hidden, rngs=rngs), Linear(hidden, width, rngs=rngs)
+        self.phi_in, self.phi_out = linear(half, hidden, rngs=rngs), linear(hidden, width, rngs=rngs)
         self.similarity_scale = 1.0 / half if config.similarity is Similarity.MEAN else 1.0
 
     def __call__(

@@ -5,6 +5,7 @@ Paper, section "Point-Embedded Transformer Decoder"; the released decoder by nam
 Coordinates are in units of the basis radius, about the root.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,6 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.hand.topology import NUM_QUERIES
-from poem_jax.models.attention import MultiHeadAttention
 from poem_jax.models.config import (
     AttentionKeys,
     CoordinateUpdate,
@@ -21,7 +21,7 @@ from poem_jax.models.config import (
     NeighbourSearch,
     VectorForm,
 )
-from poem_jax.models.linear import LayerNorm, Linear, dropout, zeros
+from poem_jax.models.layers import dropout, layer_norm, linear
 from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
     Neighbours,
@@ -134,7 +134,7 @@ class DecoderLayer(nnx.Module):
         self, config: DecoderConfig, width: int, *, output: DecoderOutput, is_last: bool, rngs: nnx.Rngs
     ) -> None:
         self.config = config
-        self.embed = Linear(width, width, rngs=rngs) if config.shared_embedding else None
+        self.embed = linear(width, width, rngs=rngs) if config.shared_embedding else None
         self.self_attention, self.cross_attention = (
             MultiHeadAttention(width, config.num_heads, dropout_rate=config.dropout, rngs=rngs)
             for _ in range(2)
@@ -142,7 +142,7 @@ class DecoderLayer(nnx.Module):
         basis_alone = config.vector_form is VectorForm.BASIS
         self.vector_attention = (VectorAttention if basis_alone else QueriesThenBasis)(width, rngs=rngs)
         self.norms = nnx.List(
-            LayerNorm(width, config.layer_norm_epsilon) for _ in range(3 if basis_alone else 2)
+            layer_norm(width, config.layer_norm_epsilon, rngs=rngs) for _ in range(3 if basis_alone else 2)
         )
         moves, hidden = output is DecoderOutput.OFFSETS, config.ffn_expansion * width
         if config.coordinate_update is CoordinateUpdate.FEED_FORWARD:
@@ -215,8 +215,8 @@ class OffsetNetwork(nnx.Module):
     """Two layers from embedding to offset; zero at first, so that learning starts from the template."""
 
     def __init__(self, width: int, hidden: int, *, rngs: nnx.Rngs) -> None:
-        self.hidden = Linear(width, hidden, rngs=rngs)
-        self.offset = Linear(hidden, 3, init=zeros, rngs=rngs)
+        self.hidden = linear(width, hidden, rngs=rngs)
+        self.offset = nnx.Linear(hidden, 3, kernel_init=nnx.initializers.zeros, rngs=rngs)
 
     def __call__(self, embeddings: Float[Array, "batch query c"]) -> Float[Array, "batch query 3"]:
         """Regress offsets."""
@@ -228,8 +228,8 @@ class ResidualNetwork(nnx.Module):
 
     def __init__(self, config: DecoderConfig, width: int, hidden: int, *, rngs: nnx.Rngs) -> None:
         self.dropout_rate = config.dropout
-        self.hidden, self.out = Linear(width, hidden, rngs=rngs), Linear(hidden, width, rngs=rngs)
-        self.norm = LayerNorm(width, config.layer_norm_epsilon)
+        self.hidden, self.out = linear(width, hidden, rngs=rngs), linear(hidden, width, rngs=rngs)
+        self.norm = layer_norm(width, config.layer_norm_epsilon, rngs=rngs)
 
     def __call__(
         self, embeddings: Float[Array, "batch query c"], dropout_key: PRNGKeyArray | None = None
@@ -243,8 +243,60 @@ class CoordinateEmbedding(nnx.Module):
     """Two layers from a coordinate to an embedding."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
-        self.hidden, self.out = Linear(3, width, rngs=rngs), Linear(width, width, rngs=rngs)
+        self.hidden, self.out = linear(3, width, rngs=rngs), linear(width, width, rngs=rngs)
 
     def __call__(self, points: Float[Array, "*batch 3"]) -> Float[Array, "*batch c"]:
         """Embed."""
         return self.out(jax.nn.relu(self.hidden(points)))
+
+
+class MultiHeadAttention(nnx.Module):
+    """softmax(Q K^T / sqrt(d / heads)) V, projected."""
+
+    def __init__(self, width: int, num_heads: int, *, dropout_rate: float = 0.0, rngs: nnx.Rngs) -> None:
+        self.num_heads, self.dropout_rate = num_heads, dropout_rate
+        self.query, self.key, self.value, self.out = (linear(width, width, rngs=rngs) for _ in range(4))
+
+    def __call__(
+        self,
+        queries: Float[Array, "batch query c"],
+        tokens: Float[Array, "batch token c"],
+        dropout_key: PRNGKeyArray | None = None,
+    ) -> Float[Array, "batch query c"]:
+        """Let every query read all tokens; in training some of the weights and results are dropped."""
+        q, k, v = (
+            self._heads(layer(x))
+            for layer, x in ((self.query, queries), (self.key, tokens), (self.value, tokens))
+        )
+        if dropout_key is None:
+            keys, out_key = None, None
+        else:
+            weights_key, out_key = jax.random.split(dropout_key)
+            keys = jax.random.split(weights_key, len(q))
+        attend = functools.partial(_attend, dropout_rate=self.dropout_rate)
+        # One head of one sample at a time, recomputed in the backward pass: no array is larger than its map,
+        # and each product is one plain matrix product, several times faster on a CPU than with heads inside.
+        read = jax.lax.map(jax.checkpoint(attend), (q, k, v, keys))  # pyright: ignore[reportPrivateImportUsage]
+        return dropout(self.out(self._joined(read, len(queries))), self.dropout_rate, out_key)
+
+    def _heads(self, x: Float[Array, "batch token c"]) -> Float[Array, "batch_head token c2"]:
+        batch, token, c = x.shape
+        split = x.reshape(batch, token, self.num_heads, c // self.num_heads)
+        return jnp.swapaxes(split, 1, 2).reshape(batch * self.num_heads, token, c // self.num_heads)
+
+    def _joined(self, read: Float[Array, "batch_head query c2"], batch: int) -> Float[Array, "batch query c"]:
+        _, query, c = read.shape
+        split = read.reshape(batch, self.num_heads, query, c)
+        return jnp.swapaxes(split, 1, 2).reshape(batch, query, self.num_heads * c)
+
+
+def _attend(
+    arguments: tuple[Array, Array, Array, PRNGKeyArray | None], *, dropout_rate: float
+) -> Float[Array, "query c"]:
+    """Let the queries of one head read its tokens."""
+    q, k, v, key = arguments
+    logits = (q * q.shape[-1] ** -0.5) @ k.T
+    weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, -1, keepdims=True)))
+    total = jnp.sum(weights, -1, keepdims=True)
+    # Divided last: the map is passed over once less.
+    return (dropout(weights, dropout_rate, key) @ v) / total

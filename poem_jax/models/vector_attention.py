@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.geometry.neighbours import nearest
-from poem_jax.models.linear import Linear
+from poem_jax.models.layers import linear
 from poem_jax.typing import Array, Float, Int
 
 
@@ -68,10 +68,10 @@ class VectorAttention(nnx.Module):
     def __init__(self, width: int, *, like_release: bool = False, rngs: nnx.Rngs) -> None:
         """`like_release`: logits are divided by the root of the width, and gamma's last layer has a bias,
         which cannot change anything: it is constant over the softmax's axis."""
-        self.alpha, self.beta, self.psi = (Linear(width, width, bias=False, rngs=rngs) for _ in range(3))
-        self.gamma_in = Linear(width, width, rngs=rngs)
-        self.gamma_out = Linear(width, width, bias=like_release, rngs=rngs)
-        self.xi_in, self.xi_out = Linear(3, width, rngs=rngs), Linear(width, width, rngs=rngs)
+        self.alpha, self.beta, self.psi = (linear(width, width, bias=False, rngs=rngs) for _ in range(3))
+        self.gamma_in = linear(width, width, rngs=rngs)
+        self.gamma_out = linear(width, width, bias=like_release, rngs=rngs)
+        self.xi_in, self.xi_out = linear(3, width, rngs=rngs), linear(width, width, rngs=rngs)
         self.logit_scale = width**-0.5 if like_release else 1.0
 
     def __call__(
@@ -117,7 +117,7 @@ class BracketedVectorAttention(nnx.Module):
     """Vector attention between two linear maps, with a residual sum (release)."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
-        self.before, self.after = Linear(width, width, rngs=rngs), Linear(width, width, rngs=rngs)
+        self.before, self.after = linear(width, width, rngs=rngs), linear(width, width, rngs=rngs)
         self.attention = VectorAttention(width, like_release=True, rngs=rngs)
 
     def among_queries(

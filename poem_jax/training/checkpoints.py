@@ -15,7 +15,7 @@ from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.checksums import check_checksums, write_checksums
-from poem_jax.models.poem import init
+from poem_jax.models.apply import init
 from poem_jax.training.config import TrainConfig, config_json, differences, flatten_config, git_commit
 from poem_jax.training.state import TrainState, create_state, evaluation_params
 from poem_jax.weights.store import check_leaves, flatten, save, unflatten

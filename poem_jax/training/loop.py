@@ -20,7 +20,7 @@ from poem_jax.batch import MultiViewBatch
 from poem_jax.data.loader import draw_ahead
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.stopping import Stopped
-from poem_jax.models import poem
+from poem_jax.models.apply import init
 from poem_jax.training.checkpoints import Checkpoints
 from poem_jax.training.config import TrainConfig, git_commit
 from poem_jax.training.journal import Journal
@@ -92,7 +92,7 @@ def _first_params(config: TrainConfig) -> Params:
     if config.train.init_from is not None:
         folder = SHIPPED if config.train.init_from == "shipped" else config.train.init_from
         return load(folder, expected=config.model)[1]
-    return poem.init(config.model, key=jax.random.key(config.train.seed))
+    return init(config.model, key=jax.random.key(config.train.seed))
 
 
 @contextmanager

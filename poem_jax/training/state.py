@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from poem_jax.models.stack import stacked_axes
+from poem_jax.models.backbones import stacked_axes
 from poem_jax.training.config import Clip, OptimizerConfig, Schedule, TrainConfig
 from poem_jax.typing import Array, Int, Params, PyTree
 

@@ -18,7 +18,7 @@ from poem_jax.losses import (
     valid_masks,
     weighted,
 )
-from poem_jax.models import poem
+from poem_jax.models.network import forward
 from poem_jax.training.config import RootSource, TrainConfig, TrainingRoot
 from poem_jax.training.state import TrainState, learning_rate, make_optimizer, update_average
 from poem_jax.typing import Array, Float, Params, PRNGKeyArray
@@ -65,7 +65,7 @@ def train_step(
 
     def loss_share(trainable: Params) -> tuple[Array, Any]:
         params = {**state.params, "trainable": trainable}
-        prediction, statistics = poem.forward(
+        prediction, statistics = forward(
             params,
             batch.views,
             cameras,

@@ -9,7 +9,7 @@ from jax.sharding import PartitionSpec as P
 
 from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.topology import ROOT_JOINT
-from poem_jax.models import poem
+from poem_jax.models.apply import apply
 from poem_jax.training.config import TrainConfig
 from poem_jax.training.parallel import AXIS, put_batch
 from poem_jax.training.source import validation_batches
@@ -57,14 +57,10 @@ class Validation:
 def _predict(
     params: Params, views: Array, cameras: Array, root_world: Array, *, config: TrainConfig
 ) -> tuple[Prediction, Prediction]:
-    """Reconstruct with the triangulated root and with the true one; leaves keep the batch axis first."""
-    found = poem.apply(params, views, cameras, config=config.model)
-    given = poem.apply(params, views, cameras, config=config.model, root_world=root_world)
-    return _batch_first(found), _batch_first(given)
-
-
-def _batch_first(prediction: Prediction) -> Prediction:
-    return prediction._replace(layers_world=prediction.layers_world.swapaxes(0, 1))
+    """Reconstruct with the triangulated root and with the true one."""
+    found = apply(params, views, cameras, config=config.model)
+    given = apply(params, views, cameras, config=config.model, root_world=root_world)
+    return found, given
 
 
 def _distance_mm(a: Array, b: Array) -> Array:

@@ -19,7 +19,7 @@ from orbax.checkpoint import v1 as ocp
 from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.models.config import Config
 from poem_jax.models.config_json import from_json, to_json
-from poem_jax.models.parameters import describe
+from poem_jax.models.network import describe
 from poem_jax.typing import Array, Params, PyTree
 
 CONFIG_FILE = "config.json"

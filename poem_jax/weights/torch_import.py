@@ -20,9 +20,9 @@ from poem_jax.hand.topology import (
     NUM_VERTICES,
 )
 from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
-from poem_jax.models.parameters import describe
+from poem_jax.models.hand_output import template_queries
+from poem_jax.models.network import describe
 from poem_jax.models.presets import preset
-from poem_jax.models.reconstruction import template_queries
 from poem_jax.typing import Float, Int, Params
 from poem_jax.weights.entries import read_entries, write_entries
 from poem_jax.weights.release_keys import (

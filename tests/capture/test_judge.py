@@ -9,7 +9,7 @@ from poem_jax.capture.network import Network
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import Config
-from poem_jax.models.inference import Prepared
+from poem_jax.models.infer import Prepared
 from poem_jax.viz.overlay import MeshInView, silhouette
 
 

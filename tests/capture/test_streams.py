@@ -17,7 +17,7 @@ from poem_jax.capture.pipeline import reconstruct
 from poem_jax.capture.take import read_take
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import Config
-from poem_jax.models.inference import Prepared
+from poem_jax.models.infer import Prepared
 
 
 def flat_network(stop=None):

@@ -61,7 +61,7 @@ def _prediction(batch: MultiViewBatch, shift: np.ndarray) -> Prediction:
         joints_world=joints,
         root_world=joints[:, ROOT_JOINT],
         keypoints_px=np.zeros((size, views, 1, 2), np.float32),
-        layers_world=np.concatenate([vertices, joints], 1)[None],
+        layers_world=np.concatenate([vertices, joints], 1)[:, None],
         valid=np.arange(size) % 2 == 0,
     )
 

@@ -14,7 +14,7 @@ from poem_jax.evaluation.benchmark import DEFAULT_SEED
 from poem_jax.evaluation.protocols import PROTOCOLS
 from poem_jax.experiments import open_experiment
 from poem_jax.experiments.synthetic_benchmark import benchmark
-from poem_jax.models import poem
+from poem_jax.models.apply import init
 from poem_jax.weights.store import save, shipped
 
 EXPERIMENT = """
@@ -46,7 +46,7 @@ def experiment(tmp_path_factory) -> tuple[Path, Path]:
     file = folder / "mini.py"
     file.write_text(EXPERIMENT)
     config = open_experiment(file).model
-    save(folder / "ckpt", config, poem.init(config, key=jax.random.key(0)))
+    save(folder / "ckpt", config, init(config, key=jax.random.key(0)))
     return file, folder / "ckpt"
 
 

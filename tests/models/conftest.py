@@ -11,7 +11,6 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
 from poem_jax.hand.template import default_hand
-from poem_jax.models.basis import basis_points
 from poem_jax.models.config import (
     AggregationConfig,
     BasisConfig,
@@ -26,8 +25,9 @@ from poem_jax.models.config import (
     Similarity,
     Stem,
 )
-from poem_jax.models.parameters import describe
-from poem_jax.models.reconstruction import template_queries
+from poem_jax.models.hand_output import template_queries
+from poem_jax.models.network import describe
+from poem_jax.models.point_features import basis_points
 
 _MICRO = Config(
     image_hw=(32, 32),

@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from poem_jax.models.attention import MultiHeadAttention
-from poem_jax.models.linear import LayerNorm
+from poem_jax.models.decoder import MultiHeadAttention
+from poem_jax.models.layers import layer_norm
 
 RNG = np.random.default_rng(0)
 QUERIES, TOKENS = (RNG.normal(size=(2, n, 8)).astype(np.float32) for n in (5, 7))
@@ -26,7 +26,7 @@ def test_equation_10_head_by_head():
 
 def test_layer_norm():
     x = jnp.asarray(3 * QUERIES + 2)
-    y = LayerNorm(8)(x)
+    y = layer_norm(8, 1e-5, rngs=nnx.Rngs(0))(x)
     np.testing.assert_allclose(jnp.mean(y, -1), 0, atol=1e-6)
     np.testing.assert_allclose(jnp.std(y, -1), 1, atol=1e-4)
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from poem_jax.geometry.cameras import Cameras
-from poem_jax.models.basis import basis_points, projected_features
 from poem_jax.models.config import BasisConfig, BasisSampling, BehindCamera
+from poem_jax.models.point_features import basis_points, projected_features
 
 
 @pytest.mark.parametrize(("sampling", "mean_radius"), [("ball", 0.075), ("gaussian", 0.0655)])

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.models.batch_norm import EPSILON, MaskedBatchNorm, NormMode, masked_moments
+from poem_jax.models.layers import BATCH_NORM_EPSILON, MaskedBatchNorm, NormMode, masked_moments
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_training_normalises_and_moves_the_running_statistics_as_torch_does(imag
     norm = MaskedBatchNorm(3)
     y = np.asarray(norm(jnp.asarray(images), NormMode(jnp.asarray(MASK))))
     kept = images[MASK].reshape(-1, 3)
-    expected = (kept - kept.mean(0)) / np.sqrt(kept.var(0) + EPSILON)
+    expected = (kept - kept.mean(0)) / np.sqrt(kept.var(0) + BATCH_NORM_EPSILON)
     np.testing.assert_allclose(y[MASK].reshape(-1, 3), expected, atol=1e-4)
     np.testing.assert_allclose(norm.mean[...], 0.1 * kept.mean(0), rtol=1e-5)
     np.testing.assert_allclose(norm.variance[...], 0.9 + 0.1 * kept.var(0, ddof=1), rtol=1e-4)
@@ -45,7 +45,7 @@ def test_inference_uses_running_statistics(images):
     norm = MaskedBatchNorm(3)
     norm.mean[...], norm.variance[...] = jnp.full(3, 2.0), jnp.full(3, 9.0)
     y = norm(jnp.asarray(images), NormMode())
-    np.testing.assert_allclose(y, (images - 2) / np.sqrt(9 + EPSILON), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(y, (images - 2) / np.sqrt(9 + BATCH_NORM_EPSILON), rtol=1e-5, atol=1e-6)
 
 
 def test_moments_over_devices_equal_those_of_the_whole(images):

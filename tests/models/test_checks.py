@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from poem_jax.geometry.cameras import Cameras
-from poem_jax.models.checks import check_inputs
-from poem_jax.models.parameters import check_params
-from poem_jax.models.poem import apply
+from poem_jax.models.apply import apply, check_inputs
+from poem_jax.models.network import check_params
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from poem_jax.models.convolution import Conv
+from poem_jax.models.layers import Conv
 
 
 @pytest.mark.parametrize("size", [1, 3, 7])

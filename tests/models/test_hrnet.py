@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from poem_jax.models.batch_norm import NormMode
+from poem_jax.models.backbones import BasicBlock, HRNet, Stack
 from poem_jax.models.config import HRNetConfig
-from poem_jax.models.hrnet import HRNet
-from poem_jax.models.residual import BasicBlock
-from poem_jax.models.stack import Stack
+from poem_jax.models.layers import NormMode
 
 
 def test_the_papers_trunk_has_the_published_size():

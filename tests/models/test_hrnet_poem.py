@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.models.poem import apply, forward
+from poem_jax.models.apply import apply
+from poem_jax.models.network import forward
 
 
 def test_inference_uses_the_images(hrnet_config, make_params, make_scene):
@@ -17,7 +18,7 @@ def test_inference_uses_the_images(hrnet_config, make_params, make_scene):
     assert first.valid.all()
     assert all(np.isfinite(leaf).all() for leaf in (first.layers_world, first.keypoints_px))
     assert np.abs(first.keypoints_px - second.keypoints_px).max() > 1e-2
-    offsets = [np.asarray(p.layers_world) - np.asarray(p.root_world)[:, None] for p in (first, second)]
+    offsets = [np.asarray(p.layers_world) - np.asarray(p.root_world)[:, None, None] for p in (first, second)]
     assert np.abs(offsets[0] - offsets[1]).max() > 1e-4
 
 

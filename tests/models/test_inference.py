@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from poem_jax.hand.topology import NUM_QUERIES, QueryOrder
-from poem_jax.models import inference
+from poem_jax.models import infer as inference
+from poem_jax.models.apply import apply
 from poem_jax.models.config import (
     AggregationConfig,
     AttentionKeys,
@@ -23,8 +24,7 @@ from poem_jax.models.config import (
     SingleView,
     VectorForm,
 )
-from poem_jax.models.inference import infer, prepare
-from poem_jax.models.poem import apply
+from poem_jax.models.infer import infer, prepare
 
 METRES = 2e-5
 MASK = np.array([[1, 1, 0, 1], [0, 1, 1, 0], [1, 1, 1, 1]], bool)
@@ -96,11 +96,11 @@ def test_only_views_and_samples_that_exist_cost_anything(micro_config, make_para
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
     mask = MASK & np.array([[True], [False], [True]])
-    found = inference.run_packed(prepared, views, cams._replace(view_mask=mask))
+    found = inference.infer_unchecked(prepared, views, cams._replace(view_mask=mask))
     assert seen == [mask.sum(), 2]
     np.testing.assert_array_equal(found.valid, [True, False, True])
     assert not np.any(found.vertices_world[1])
-    nothing = inference.run_packed(prepared, views, cams._replace(view_mask=np.zeros((3, 4), bool)))
+    nothing = inference.infer_unchecked(prepared, views, cams._replace(view_mask=np.zeros((3, 4), bool)))
     assert not nothing.valid.any()
     assert np.isfinite(nothing.vertices_world).all()
 
@@ -165,7 +165,7 @@ def test_broken_views_are_left_out_and_flagged(micro_config, make_params, make_s
     K = cams.K.copy()
     K[0, 1, 0, 0] = np.nan
     prepared = prepare(make_params(micro_config), micro_config)
-    found = inference.run_packed(prepared, views, cams._replace(K=K))
+    found = inference.infer_unchecked(prepared, views, cams._replace(K=K))
     np.testing.assert_array_equal(found.valid, [False, True])
     assert np.isfinite(found.vertices_world).all()
 

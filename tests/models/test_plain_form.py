@@ -18,10 +18,10 @@ import pytest
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
-from poem_jax.models import inference, poem
+from poem_jax.models import apply, infer
 from poem_jax.models.config import BehindCamera, DecoderOutput, FirstNeighbours, ViewWeights
+from poem_jax.models.hand_output import template_queries
 from poem_jax.models.presets import TINY, V2_MEDIUM_RELEASE, preset
-from poem_jax.models.reconstruction import template_queries
 from tests.models import numpy_geometry
 
 FILE = Path(__file__).resolve().parents[2] / "benchmarks" / "plain_form.py"
@@ -160,20 +160,16 @@ def compare(oracle, make_params, make_scene):
             assert np.isfinite(expected.layers).all()
             apart = []
             for result in (
-                poem.apply(params, images, cams, config=config, root_world=root),
-                inference.infer(inference.prepare(params, config), images, cams, root_world=root),
+                apply.apply(params, images, cams, config=config, root_world=root),
+                infer.infer(infer.prepare(params, config), images, cams, root_world=root),
             ):
                 np.testing.assert_allclose(result.keypoints_px, expected.keypoints_px, atol=1e-7)
                 np.testing.assert_allclose(result.heat_maps, expected.heat_maps, atol=1e-10)
-                apart.append(np.linalg.norm(_layers(result) - expected.layers, axis=-1).max())
+                apart.append(np.linalg.norm(result.layers_world - expected.layers, axis=-1).max())
         print(f"{[f'{distance:.1e}' for distance in apart]} m")
         return apart
 
     return compare
-
-
-def _layers(result) -> np.ndarray:
-    return np.moveaxis(result.layers_world, 0, 1)
 
 
 def _float64(tree):
@@ -230,10 +226,10 @@ def test_float32_is_off_by_rounding(plain_form, micro_config, make_params, make_
     root = np.full((1, 3), 0.01, np.float32)
     expected, _ = _plain(plain_form, "forward", config)(params, images, cams, root=root)
     for result in (
-        poem.apply(params, images, cams, config=config, root_world=root),
-        inference.infer(inference.prepare(params, config), images, cams, root_world=root),
+        apply.apply(params, images, cams, config=config, root_world=root),
+        infer.infer(infer.prepare(params, config), images, cams, root_world=root),
     ):
-        apart = np.linalg.norm(_layers(result) - np.moveaxis(expected.layers, 0, 1), axis=-1)
+        apart = np.linalg.norm(result.layers_world - expected.layers, axis=-1)
         assert np.mean(apart < 1e-5) > 0.995
         assert np.median(apart) < 2e-6
 

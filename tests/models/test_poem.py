@@ -11,9 +11,8 @@ import pytest
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle, skew_matrix, transform_points
 from poem_jax.hand.model import HandModel, hand_mesh
-from poem_jax.models import poem
-from poem_jax.models.parameters import describe
-from poem_jax.models.poem import apply, forward, init
+from poem_jax.models.apply import _predict, apply, init
+from poem_jax.models.network import describe, forward
 
 CONFIGS = ("micro_config", "joints_config", "parametric_config")
 METRES = 2e-5
@@ -53,20 +52,20 @@ def _mask(cams, mask):
 
 def test_shapes(model, make_scene):
     prediction = model(*make_scene(2, 4))
-    layers = prediction.layers_world.shape[0]
+    layers = prediction.layers_world.shape[1]
     assert prediction.vertices_world.shape == (2, 778, 3)
     assert prediction.joints_world.shape == (2, 21, 3)
-    assert prediction.layers_world.shape == (layers, 2, 799, 3)
+    assert prediction.layers_world.shape == (2, layers, 799, 3)
     assert layers == 2
     assert prediction.keypoints_px.shape[:2] == (2, 4)
     assert prediction.valid.all()
-    np.testing.assert_array_equal(prediction.layers_world[-1, :, :778], prediction.vertices_world)
+    np.testing.assert_array_equal(prediction.layers_world[:, -1, :778], prediction.vertices_world)
 
 
 def test_inputs_matter(model, make_scene):
     """Guards the tests below against outputs that depend on nothing."""
     first, second = (model(*make_scene(2, 4, seed)) for seed in (0, 1))
-    root_relative = [_points(p) - np.asarray(p.root_world)[:, None] for p in (first, second)]
+    root_relative = [_points(p) - np.asarray(p.root_world)[:, None, None] for p in (first, second)]
     assert np.abs(root_relative[0] - root_relative[1]).max() > 1e-3
 
 
@@ -113,8 +112,8 @@ def test_other_samples_do_not_matter(model, make_scene):
     mixed = np.stack([views[0], other_views[1]])
     mixed_cams = Cameras(*(np.stack([a[0], b[1]]) for a, b in zip(cams, other_cams, strict=True)))
     expected, found = model(views, cams), model(mixed, mixed_cams)
-    np.testing.assert_allclose(_points(found)[:, 0], _points(expected)[:, 0], atol=METRES)
-    assert np.abs(_points(found)[:, 1] - _points(expected)[:, 1]).max() > 1e-3
+    np.testing.assert_allclose(_points(found)[0], _points(expected)[0], atol=METRES)
+    assert np.abs(_points(found)[1] - _points(expected)[1]).max() > 1e-3
 
 
 def test_permuted_basis_changes_nothing(micro_config, make_params, make_scene):
@@ -133,7 +132,7 @@ def test_known_root_is_used_and_one_view_is_enough(micro, make_scene):
     prediction = micro(views, _mask(cams, [[0, 0, 1, 0], [1, 1, 1, 1]]), root_world=root)
     assert prediction.valid.all()
     np.testing.assert_allclose(prediction.root_world, root, atol=1e-6)
-    assert np.linalg.norm(_points(prediction) - root[:, None], axis=-1).max() < 2
+    assert np.linalg.norm(_points(prediction) - root[:, None, None], axis=-1).max() < 2
 
 
 def test_known_and_unknown_roots_mix(micro, make_scene):
@@ -143,7 +142,7 @@ def test_known_and_unknown_roots_mix(micro, make_scene):
     prediction = micro(views, mixed, root_world=root)
     assert prediction.valid.all()
     np.testing.assert_allclose(prediction.root_world[0], root[0], atol=1e-6)
-    np.testing.assert_allclose(_points(prediction)[:, 1], _points(micro(views, cams))[:, 1], atol=METRES)
+    np.testing.assert_allclose(_points(prediction)[1], _points(micro(views, cams))[1], atol=METRES)
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -184,10 +183,10 @@ def test_parametric_output_is_the_hand_model(parametric_config, make_params, mak
 def test_new_view_masks_compile_nothing(micro, make_scene):
     views, cams = make_scene(2, 4)
     micro(views, cams)
-    programs = poem._predict._cache_size()
+    programs = _predict._cache_size()
     for mask in ([[1, 1, 0, 1], [0, 1, 1, 0]], [[0, 0, 1, 1], [1, 1, 1, 1]]):
         micro(views, cams._replace(view_mask=np.array(mask, bool)))
-    assert poem._predict._cache_size() == programs
+    assert _predict._cache_size() == programs
 
 
 def test_unsolvable_samples_under_a_trace_are_flagged_and_finite(micro, make_scene):
@@ -216,7 +215,7 @@ def test_vmap_and_pmap(micro, make_scene):
     expected = _points(micro(views, cams))
     device_and_lane = jax.tree.map(lambda x: x[:, None, None], (views, cams))
     prediction = jax.pmap(jax.vmap(micro))(*device_and_lane)
-    found = np.asarray(prediction.layers_world)[:, 0, :, 0].swapaxes(0, 1)
+    found = np.asarray(prediction.layers_world)[:, 0, 0]
     np.testing.assert_allclose(found, expected, atol=METRES)
 
 

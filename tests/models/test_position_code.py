@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from poem_jax.models.position_code import ViewRowColumnCode, axis_code, sine_code
+from poem_jax.models.point_features import ViewRowColumnCode, axis_code, sine_code
 
 
 def test_sine_code_is_the_written_formula():

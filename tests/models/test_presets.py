@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from poem_jax.models.parameters import describe
+from poem_jax.models.network import describe
 from poem_jax.models.presets import PRESETS, preset
 
 

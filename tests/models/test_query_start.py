@@ -6,7 +6,7 @@ import pytest
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
-from poem_jax.models.query_start import pose_by_joints
+from poem_jax.models.hand_output import pose_by_joints
 
 HAND = default_hand()
 REST = hand_mesh(HAND, np.zeros((16, 3), np.float32), np.zeros(10, np.float32))

@@ -1,7 +1,7 @@
 import jax
 import numpy as np
 
-from poem_jax.models.resampling import double_bilinear, repeat_pixels
+from poem_jax.models.layers import double_bilinear, repeat_pixels
 
 X = np.random.default_rng(0).normal(size=(2, 3, 5, 4)).astype(np.float32)
 

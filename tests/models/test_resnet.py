@@ -3,9 +3,9 @@ import jax.numpy as jnp
 import pytest
 from flax import nnx
 
-from poem_jax.models.batch_norm import NormMode
+from poem_jax.models.backbones import ResNet
 from poem_jax.models.config import ResNetConfig, Stem
-from poem_jax.models.resnet import ResNet
+from poem_jax.models.layers import NormMode
 
 
 def _abstract(config: ResNetConfig, hw: int):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from poem_jax.models.config import ViewWeights
+from poem_jax.models.heat_maps import heat_variance
 from poem_jax.models.presets import PRESETS
-from poem_jax.models.root import spread
 
 
 def gaussian(centre, sigma, size=(48, 40)):
@@ -18,14 +18,16 @@ def gaussian(centre, sigma, size=(48, 40)):
 @pytest.mark.parametrize("sigma", [(1.0, 1.0), (3.0, 2.0), (2.0, 4.0)])
 def test_the_spread_of_a_normal_map_is_its_variance(sigma):
     maps = np.stack([gaussian(centre, sigma) for centre in ((20.0, 24.0), (17.5, 22.25))])
-    np.testing.assert_allclose(spread(jnp.asarray(maps, jnp.float32)), sum(s**2 for s in sigma), rtol=1e-3)
+    np.testing.assert_allclose(
+        heat_variance(jnp.asarray(maps, jnp.float32)), sum(s**2 for s in sigma), rtol=1e-3
+    )
 
 
 def test_a_single_cell_has_no_spread_and_two_cells_have_their_distances():
     maps = np.zeros((2, 8, 8), np.float32)
     maps[0, 3, 5] = 1
     maps[1, 2, 1] = maps[1, 2, 5] = 0.5
-    np.testing.assert_allclose(spread(jnp.asarray(maps)), [0, 4], atol=1e-5)
+    np.testing.assert_allclose(heat_variance(jnp.asarray(maps)), [0, 4], atol=1e-5)
 
 
 def test_paper_and_release_weigh_all_views_alike():

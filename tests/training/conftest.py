@@ -10,7 +10,7 @@ from poem_jax.batch import MultiViewBatch
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.hand import default_hand, hand_mesh
 from poem_jax.losses import SYNTHETIC
-from poem_jax.models import poem
+from poem_jax.models.apply import init
 from poem_jax.models.config import (
     BasisConfig,
     Config,
@@ -56,7 +56,7 @@ def compile_once(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def micro_params() -> dict:
-    return poem.init(MICRO, key=jax.random.key(0))
+    return init(MICRO, key=jax.random.key(0))
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from poem_jax.batch import MultiViewBatch
 from poem_jax.experiments import experiment_names, open_experiment
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.models.config import HRNetConfig
-from poem_jax.models.parameters import describe
+from poem_jax.models.network import describe
 from poem_jax.training.config import (
     BatchShape,
     DataConfig,

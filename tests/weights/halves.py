@@ -10,20 +10,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import pytest
+from flax import nnx
 
 from poem_jax.batch import Prediction
-from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.neighbours import nearest
-from poem_jax.models import aggregation, decoder, poem, position_code, reconstruction, root, vector_attention
-from poem_jax.models.attention import MultiHeadAttention
-from poem_jax.models.batch_norm import NormMode
+from poem_jax.models import aggregation, decoder, heat_maps, layers, network, point_features, vector_attention
+from poem_jax.models.backbones import HRNet
 from poem_jax.models.config import Config
-from poem_jax.models.hrnet import HRNet
-from poem_jax.models.linear import LayerNorm
-from poem_jax.models.parameters import assemble
-from poem_jax.models.primary_frame import enter_primary_frame, leave_primary_frame
-from poem_jax.models.pyramid import BottomUpBranch
-from poem_jax.models.reconstruction import ViewFeatures
+from poem_jax.models.network import ViewFeatures, assemble
+from poem_jax.models.world_frame import WorkingFrame
 from poem_jax.typing import Array, Params
 
 
@@ -37,16 +32,20 @@ def _rows40(args: tuple, out: Any) -> Any:
 
 HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
     "levels": (HRNet, "__call__", _whole),
-    "mlvl_feat": (BottomUpBranch, "__call__", _whole),
-    "input_proj": (reconstruction.FeatureBranch, "__call__", _whole),
-    "pooled": (root, "max_pool", _whole),
-    "position": (position_code.ViewRowColumnCode, "__call__", _whole),
-    "axis_codes": (position_code, "axis_code", _whole),
-    "sampled": (reconstruction, "projected_features", lambda args, out: (out[0][:, :, ::128], out[1])),
+    "mlvl_feat": (point_features.BottomUpBranch, "__call__", _whole),
+    "input_proj": (point_features.FeatureBranch, "__call__", _whole),
+    "pooled": (heat_maps, "max_pool", _whole),
+    "position": (point_features.ViewRowColumnCode, "__call__", _whole),
+    "axis_codes": (point_features, "axis_code", _whole),
+    "sampled": (network, "projected_features", lambda args, out: (out[0][:, :, ::128], out[1])),
     "tokens": (aggregation, "row_major_tokens", lambda args, out: out[:, :, ::128]),
     "basis_features": (aggregation.ProjectiveAggregation, "__call__", lambda args, out: out[:, ::64]),
-    "embedded": (MultiHeadAttention, "__call__", lambda args, out: (args[1][:, ::40], args[2][:, ::256])),
-    "norms": (LayerNorm, "__call__", _rows40),
+    "embedded": (
+        decoder.MultiHeadAttention,
+        "__call__",
+        lambda args, out: (args[1][:, ::40], args[2][:, ::256]),
+    ),
+    "norms": (nnx.LayerNorm, "__call__", _rows40),
     "vec_self": (vector_attention.BracketedVectorAttention, "among_queries", _rows40),
     "vec_cross": (vector_attention.BracketedVectorAttention, "to_basis", _rows40),
     "out": (decoder.DecoderLayer, "__call__", lambda args, out: out[0][:, ::40]),
@@ -76,31 +75,25 @@ def listening() -> Iterator[dict[str, list]]:
 @functools.partial(jax.jit, static_argnames="config")
 def look(params: Params, views: Array, *, config: Config) -> tuple[ViewFeatures, dict[str, list]]:
     """Run what is done with every view alone."""
-    dtype = params["constants"]["basis_points"].dtype
     model = assemble(config, params)
     with listening() as heard:
-        images = poem.normalised_images(views.reshape(-1, *views.shape[2:]), config, dtype)
-        seen = model.look(images, NormMode())
+        seen = model.look(views, layers.NormMode())
     heard["uv_logits"] = [model.heat_maps.to_logits(heard["pooled"][0])]
-    return ViewFeatures(*(leaf.reshape(*views.shape[:2], *leaf.shape[1:]) for leaf in seen)), dict(heard)
+    return seen, dict(heard)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def reconstruct(
-    params: Params, seen: ViewFeatures, cams: Cameras, root_world: Array, swapped: Array, *, config: Config
+def find_hands(
+    params: Params, seen: ViewFeatures, frame: WorkingFrame, swapped: Array, *, config: Config
 ) -> tuple[Prediction, Array, dict[str, list]]:
     """Run the rest; `swapped` (search, batch, query) read their 33rd nearest point in place of the 32nd.
 
     Returns: the prediction, how much farther the 33rd is (squared, units of 10 cm), and what was heard.
     """
     model, gaps = assemble(config, params), []
-    frame = enter_primary_frame(cams, root_world)
     with listening() as heard, pytest.MonkeyPatch.context() as patch:
         patch.setattr(vector_attention, "nearest", nearest_but_for(swapped, gaps))
-        first = model.first_surroundings()
-        result = model.reconstruct(seen, frame.cams, frame.root, NormMode(), first)
-    order = config.decoder.query_order
-    prediction = leave_primary_frame(result, frame.T_world_from_primary, model.hand.model(), order)
+        prediction = model.find_hands(seen, frame, layers.NormMode())
     return prediction, jnp.stack(gaps), dict(heard)
 
 

@@ -137,7 +137,9 @@ def inputs(case: str) -> dict[str, np.ndarray]:
 
 @functools.cache
 def golden(file: str) -> dict[str, np.ndarray]:
-    return dict(np.load(REFERENCE / f"golden_{file}.npz"))
+    """Read stored outputs; points of all blocks become (batch, layer, 799, 3), as in `Prediction`."""
+    stored = dict(np.load(REFERENCE / f"golden_{file}.npz"))
+    return {k: np.moveaxis(v, 0, 1) if "all_coords_preds" in k else v for k, v in stored.items()}
 
 
 def batch_of(case: str) -> MultiViewBatch:

@@ -25,7 +25,6 @@ from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.losses import RELEASE, multi_view_losses
-from poem_jax.models import poem
 from tests.weights.procedural import (
     IMAGE_HW,
     batch_of,
@@ -110,7 +109,9 @@ def share_within(case: Case, prediction: Prediction, block: int) -> float:
 
 
 def distances(case: Case, prediction: Prediction, block: int) -> np.ndarray:
-    return np.linalg.norm(prediction.layers_world[block] - case.stored["all_coords_preds"][block], axis=-1)
+    return np.linalg.norm(
+        prediction.layers_world[:, block] - case.stored["all_coords_preds"][:, block], axis=-1
+    )
 
 
 def check_keypoints(case: Case, key: str) -> None:
@@ -129,7 +130,7 @@ def check_reference_joints(case: Case, key: str) -> None:
 
 
 def check_blocks(case: Case, key: str) -> None:
-    close(predicted(case).layers_world[0], case.stored[key][0], FIRST_BLOCK_M)
+    close(predicted(case).layers_world[:, 0], case.stored[key][:, 0], FIRST_BLOCK_M)
     for block in (1, 2):
         assert_points_agree(distances(case, final(case), block), limit_m(case.model, block))
 
@@ -264,15 +265,15 @@ def masked_runs() -> tuple[dict[str, Prediction], list[int]]:
         batch = amid_garbage(batch_of("A"), places)
         prediction = poem_jax.apply(params, batch.views, batch.cameras, config=config)
         found[name] = jax.tree.map(np.asarray, prediction)
-        programs.append(poem._predict._cache_size())
+        programs.append(_predict._cache_size())
     return found, programs
 
 
 def assert_same(ours: Prediction, other: Prediction) -> None:
     """Compare two programs of ours, which may round differently; a view too many would move every point."""
-    close(ours.layers_world[0], other.layers_world[0], 1e-6)
+    close(ours.layers_world[:, 0], other.layers_world[:, 0], 1e-6)
     for block in (1, 2):
-        gap = np.linalg.norm(ours.layers_world[block] - other.layers_world[block], axis=-1)
+        gap = np.linalg.norm(ours.layers_world[:, block] - other.layers_world[:, block], axis=-1)
         assert np.median(gap) < 1e-6
         assert np.mean(gap <= limit_m("small", block)) >= MANY
         assert gap.max() <= FARTHEST_M
@@ -308,5 +309,5 @@ def test_batch_of_mixed_view_counts_equals_each_sample_alone() -> None:
     seen = mixed.cameras.view_mask
     apart = np.concatenate([prediction.keypoints_px for prediction in alone])
     close(together.keypoints_px[seen], apart[seen], 1e-4)
-    layers = np.concatenate([prediction.layers_world for prediction in alone], 1)
+    layers = np.concatenate([prediction.layers_world for prediction in alone])
     assert_same(together, together._replace(layers_world=layers))

@@ -16,7 +16,8 @@ from scipy.special import erf
 
 from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
-from tests.weights.halves import look, reconstruct
+from poem_jax.models.world_frame import enter_working_frame
+from tests.weights.halves import find_hands, look
 from tests.weights.procedural import IMAGE_HW, batch_of, golden, needs_reference, released, weight
 from tests.weights.ties import PARAMETRIC
 
@@ -45,7 +46,8 @@ def exact(model: str) -> Exact:
         seen, heard = look(params, batch.views, config=config)
         roots = released_roots(batch, np.asarray(seen.keypoints_px))
         nothing = np.zeros((4, len(roots), NUM_QUERIES), bool)
-        prediction, _, more = reconstruct(params, seen, batch.cameras, roots, nothing, config=config)
+        frame = enter_working_frame(batch.views, batch.cameras, roots, np.float64)
+        prediction, _, more = find_hands(params, seen, frame, nothing, config=config)
     return Exact(*jax.tree.map(np.asarray, (prediction, heard | more)))
 
 
@@ -230,7 +232,7 @@ def search_points(model: str, block: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the queries and the basis points among which a block searches, units of 10 cm."""
     config, params = released(model)
     prediction = exact(model).prediction
-    queries = prediction.layers_world[block - 1] - prediction.root_world[:, None]
+    queries = prediction.layers_world[:, block - 1] - prediction.root_world[:, None]
     return queries / config.basis.radius, params["constants"]["basis_points"] / config.basis.radius
 
 

@@ -26,8 +26,8 @@ from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.losses import RELEASE, multi_view_losses
 from poem_jax.models import poem, vector_attention
+from poem_jax.models.backbones import Stack
 from poem_jax.models.config import Config
-from poem_jax.models.stack import Stack
 from poem_jax.training.state import clip_each_tensor
 from poem_jax.typing import Array, Params
 from poem_jax.weights.entries import write_entries

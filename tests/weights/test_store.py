@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import poem_jax
-from poem_jax.models import poem
+from poem_jax.models.apply import init
 from poem_jax.models.config import BasisConfig, Config, DecoderConfig, ResNetConfig, RootConfig, Stem
 from poem_jax.models.config_json import to_json
 from poem_jax.weights import store
@@ -30,7 +30,7 @@ MICRO = Config(
 
 @pytest.fixture(scope="module")
 def params():
-    return poem.init(MICRO, key=jax.random.key(0))
+    return init(MICRO, key=jax.random.key(0))
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import poem_jax
 from poem_jax.hand import mano_file
 from poem_jax.hand.model import mirror
 from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
-from poem_jax.models.parameters import describe
+from poem_jax.models.network import describe
 from poem_jax.models.presets import preset
 from poem_jax.typing import Params
 from poem_jax.weights.entries import write_entries
@@ -394,7 +394,9 @@ def changes(model: str, names: list[str]) -> dict[str, float]:
 
     def points(state: dict[str, np.ndarray]) -> np.ndarray:
         config, params = imported(state, model)
-        return np.asarray(poem_jax.apply(params, batch.views, batch.cameras, config=config).layers_world[-1])
+        return np.asarray(
+            poem_jax.apply(params, batch.views, batch.cameras, config=config).layers_world[:, -1]
+        )
 
     before, moved = points(state), {}
     for name in names:

@@ -13,7 +13,8 @@ import numpy as np
 
 from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.topology import NUM_QUERIES
-from tests.weights.halves import look, reconstruct
+from poem_jax.models.world_frame import enter_working_frame
+from tests.weights.halves import find_hands, look
 from tests.weights.procedural import known_root, released
 
 PARAMETRIC = "medium_MANO"
@@ -53,22 +54,20 @@ class Rerun:
         self.config, self.params = released(model)
         self.seen, _ = look(self.params, batch.views, config=self.config)
         root = known_root(batch) if root_world is None else root_world
-        self.root = np.full((len(batch.views), 3), np.nan, np.float32) if root is None else root
+        self.frame = enter_working_frame(batch.views, batch.cameras, root, np.float32)
 
     def __call__(self, swapped: np.ndarray) -> Run:
-        prediction, gaps, heard = reconstruct(
-            self.params, self.seen, self.batch.cameras, self.root, swapped, config=self.config
-        )
+        prediction, gaps, heard = find_hands(self.params, self.seen, self.frame, swapped, config=self.config)
         found = jax.tree.map(np.asarray, (prediction, gaps, heard["neighbours"]))
         return Run(found[0], found[1], np.stack(found[2]), swapped)
 
     def distances(self, run: Run, block: int) -> np.ndarray:
-        return np.linalg.norm(run.prediction.layers_world[block] - self.stored[block], axis=-1)
+        return np.linalg.norm(run.prediction.layers_world[:, block] - self.stored[:, block], axis=-1)
 
 
 def resolve(rerun: Rerun) -> Run:
     """Swap the ties of the queries that are off, block by block."""
-    run = rerun(np.zeros((4, len(rerun.root), NUM_QUERIES), bool))
+    run = rerun(np.zeros((4, len(rerun.stored), NUM_QUERIES), bool))
     for block, searches in SEARCHES.items():
         if rerun.model == PARAMETRIC and block == 2:
             return _resolve_under_mesh(rerun, run)

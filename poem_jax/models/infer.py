@@ -16,24 +16,21 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from poem_jax.batch import Prediction
-from poem_jax.geometry.cameras import Cameras, fill_masked_views
-from poem_jax.models import parameters
-from poem_jax.models.batch_norm import NormMode
-from poem_jax.models.checks import check_inputs
+from poem_jax.geometry.cameras import Cameras
+from poem_jax.models import network
+from poem_jax.models.apply import check_inputs, check_solved
 from poem_jax.models.config import Config
 from poem_jax.models.decoder import Surroundings
-from poem_jax.models.far_world import Origin, centre_world, move_back
-from poem_jax.models.poem import normalised_images
-from poem_jax.models.primary_frame import enter_primary_frame, leave_primary_frame
-from poem_jax.models.reconstruction import ViewFeatures
+from poem_jax.models.layers import NormMode
+from poem_jax.models.network import ViewFeatures
+from poem_jax.models.world_frame import WorkingFrame, enter_working_frame, is_traced
 from poem_jax.typing import Array, Float, Num, Params
 
 _VIEWS_AT_A_TIME = 8
@@ -59,7 +56,7 @@ def prepare(params: Params, config: Config) -> Prepared:
     Raises:
         ValueError: `params` of another config.
     """
-    parameters.check_params(config, params)
+    network.check_params(config, params)
     return jax.device_put(Prepared(params, _first_surroundings(params, config), config))
 
 
@@ -78,13 +75,16 @@ def infer(
     Raises:
         ValueError: as `apply`, and traced inputs.
     """
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((views, cams, root_world))):
+    if is_traced(views, cams, root_world):
         raise ValueError("`infer` looks at the values of its inputs; under jit, grad or vmap use `apply`")
     check_inputs(views, cams, root_world, prepared.config)
-    return run_packed(prepared, views, cams, root_world=root_world)
+    frame = _frame(prepared, views, cams, root_world)
+    prediction = _infer_in_frame(prepared, views, frame)
+    check_solved(prediction, frame)
+    return prediction
 
 
-def run_packed(
+def infer_unchecked(
     prepared: Prepared,
     views: Num[Array, "batch view h w 3"],
     cams: Cameras,
@@ -96,33 +96,17 @@ def run_packed(
     A view that is masked, or whose image or camera is not finite, is left out. On a CPU a sample without any
     view costs nothing and is zero.
     """
-    dtype = prepared.params["constants"]["basis_points"].dtype
-    cams, root, origin = centre_world(cams, root_world, dtype)
-    mask = np.asarray(cams.view_mask)
-    finite = [_finite_per_view(values) for values in (views, cams.K, cams.T_cam_from_world)]
-    sound = functools.reduce(np.logical_and, finite, mask)
-    seen = _look_at_valid(prepared, np.asarray(views), sound)
-    K, T_cam_from_world, _ = fill_masked_views(Cameras(cams.K, cams.T_cam_from_world, sound))
-    if root is None:
-        root = np.full((len(mask), 3), np.nan)
-    samples = _Samples(
-        seen,
-        Cameras(np.asarray(K, dtype), np.asarray(T_cam_from_world, dtype), sound),
-        np.asarray(root, dtype),
-        (sound == mask).all(-1),
-        origin,
-    )
-    return _find_hands(prepared, samples)
+    return _infer_in_frame(prepared, views, _frame(prepared, views, cams, root_world))
 
 
-class _Samples(NamedTuple):
-    """What the second half needs, all with a leading batch axis."""
+def _frame(prepared: Prepared, views: Array, cams: Cameras, root_world: Array | None) -> WorkingFrame:
+    concrete = (np.asarray(views), Cameras(*map(np.asarray, cams)), root_world)
+    return enter_working_frame(*concrete, network.number_type(prepared.params))
 
-    seen: ViewFeatures
-    cams: Cameras
-    root: Float[Array, "batch 3"]
-    whole: Array
-    origin: Origin
+
+def _infer_in_frame(prepared: Prepared, views: Array, frame: WorkingFrame) -> Prediction:
+    seen = _look_at_valid(prepared, np.asarray(views), frame.cams.view_mask)
+    return _find_hands(prepared, seen, frame)
 
 
 def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> ViewFeatures:
@@ -139,20 +123,17 @@ def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> 
     return _read(buffers, place)
 
 
-def _find_hands(prepared: Prepared, samples: _Samples) -> Prediction:
+def _find_hands(prepared: Prepared, seen: ViewFeatures, frame: WorkingFrame) -> Prediction:
     """Run the second half: on accelerators the whole batch at once, on a CPU sample by sample."""
+    samples = (seen, frame)
     if not _on_cpu():
-        return _batch_second(_find(prepared, samples))
-    rows = np.flatnonzero(samples.cams.view_mask.any(-1)) if samples.cams.view_mask.any() else np.array([0])
+        return _find(prepared, samples)
+    rows = np.flatnonzero(frame.cams.view_mask.any(-1)) if frame.cams.view_mask.any() else np.array([0])
     parts = [jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], samples) for row in rows]
     found = dict(zip(rows.tolist(), _run_all(_find, prepared, parts), strict=True))
     empty = jax.tree.map(jnp.zeros_like, found[int(rows[0])])
-    ordered = [found.get(row, empty) for row in range(len(samples.root))]
-    return _batch_second(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ordered))
-
-
-def _batch_second(found: Prediction) -> Prediction:
-    return found._replace(layers_world=jnp.moveaxis(found.layers_world, 0, 1))
+    ordered = [found.get(row, empty) for row in range(len(frame.known_root))]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ordered)
 
 
 def _run_all(function: Callable, prepared: Prepared, parts: list) -> list:
@@ -201,24 +182,14 @@ def _on_cpu() -> bool:
 
 
 @jax.jit
-def _look(prepared: Prepared, images: Array) -> ViewFeatures:
-    model = parameters.assemble(prepared.config, prepared.params)
-    dtype = prepared.params["constants"]["basis_points"].dtype
-    return model.look(normalised_images(images, prepared.config, dtype), NormMode())
+def _look(prepared: Prepared, views: Array) -> ViewFeatures:
+    return network.assemble(prepared.config, prepared.params).look(views, NormMode())
 
 
 @jax.jit
-def _find(prepared: Prepared, samples: _Samples) -> Prediction:
-    """Find the hands; `layers_world` with the batch axis first, like all the rest."""
-    config = prepared.config
-    model = parameters.assemble(config, prepared.params)
-    frame = enter_primary_frame(samples.cams, samples.root)
-    result = model.reconstruct(samples.seen, frame.cams, frame.root, NormMode(), prepared.first)
-    result = result._replace(valid=result.valid & samples.whole)
-    hand, order = model.hand.model(), config.decoder.query_order
-    prediction = leave_primary_frame(result, frame.T_world_from_primary, hand, order)
-    prediction = move_back(prediction, samples.origin)
-    return prediction._replace(layers_world=jnp.moveaxis(prediction.layers_world, 1, 0))
+def _find(prepared: Prepared, samples: tuple[ViewFeatures, WorkingFrame]) -> Prediction:
+    model = network.assemble(prepared.config, prepared.params)
+    return model.find_hands(*samples, NormMode(), prepared.first)
 
 
 @functools.cache
@@ -229,7 +200,7 @@ def _one_thread(function: Callable) -> Callable:
 
 @functools.partial(jax.jit, static_argnames="config")
 def _first_surroundings(params: Params, config: Config) -> Surroundings | None:
-    return parameters.assemble(config, params).prepared_surroundings()
+    return network.assemble(config, params).prepared_surroundings()
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
@@ -255,10 +226,3 @@ def _read(buffers: ViewFeatures, place: Array) -> ViewFeatures:
         return jnp.where(empty, 0, buffer[place])
 
     return jax.tree.map(rows, buffers)
-
-
-def _finite_per_view(values: Array) -> np.ndarray:
-    values = np.asarray(values)
-    if values.dtype == np.uint8:
-        return np.ones(values.shape[:2], bool)
-    return np.isfinite(values).all(tuple(range(2, values.ndim)))

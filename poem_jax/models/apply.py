@@ -1,0 +1,227 @@
+"""The public face of the models: `init` and `apply`, with the checks of their arguments.
+
+Static facts are checked always; values only where they are concrete, not traced.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+from flax import nnx
+
+from poem_jax.batch import Prediction
+from poem_jax.geometry.camera_checks import check_cameras
+from poem_jax.geometry.cameras import Cameras, fill_masked_views, normalised_from_pixels
+from poem_jax.geometry.transforms import invert_rigid, rotate_points
+from poem_jax.geometry.triangulation import MIN_BASELINE
+from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT
+from poem_jax.models import network
+from poem_jax.models.config import Config
+from poem_jax.models.layers import NormMode
+from poem_jax.models.presets import V2_BASE
+from poem_jax.models.world_frame import WorkingFrame, enter_working_frame, is_traced
+from poem_jax.typing import Array, Float, Num, Params, PRNGKeyArray
+
+_PARALLEL = 1e-2
+"""Radians. Rays that differ by less are called parallel in messages."""
+
+
+def init(config: Config, *, key: PRNGKeyArray) -> Params:
+    """Return fresh parameters: `trainable`, `statistics`, and `constants` (basis, template, hand).
+
+    The weights are drawn by NumPy with a seed from `key`, since that compiles nothing. Under `jit` or `vmap`
+    JAX draws them: other numbers of the same distribution, and a minute of compiling for a large model.
+    """
+    return jax.tree.map(jax.numpy.asarray, network.split(network.build(config, nnx.Rngs(params=key))))
+
+
+def apply(
+    params: Params,
+    views: Num[Array, "batch view h w 3"],
+    cams: Cameras,
+    *,
+    config: Config | None = None,
+    root_world: Float[Array, "batch 3"] | None = None,
+) -> Prediction:
+    """Reconstruct one hand per sample from its valid views.
+
+    Pure: `jax.jit`, `vmap`, `grad` (with respect to `params`, `cams` and `root_world`) and `pmap` work on
+    it. The padded numbers of samples and views choose the program; `cams.view_mask` does not. It is bool and
+    has no derivative, so gradients of whole cameras need `allow_int`:
+
+        jax.grad(lambda cams: apply(params, views, cams).vertices_world.sum(), allow_int=True)(cams)
+
+    whose fields `K` and `T_cam_from_world` hold the gradient; or differentiate by these two arrays alone.
+
+    The world may have its origin far from the hand (up to 1.6 km), and then `T_cam_from_world` should be
+    float64: concrete extrinsics are moved to the primary camera before anything is rounded. Under a trace
+    (`jit`, `grad`) they cannot be, so there the origin should be within some metres of the hand.
+
+    Args:
+        params: from `init` or `load`.
+        views: RGB, uint8 or float in [0, 1]; masked views may hold anything.
+        cams: intrinsics of these images, extrinsics from any world frame, `view_mask`.
+        config: the configuration that `params` were made with; None = `v2-base`.
+        root_world: joint 9 in metres where it is known; needed by samples with one view. A row of NaN is
+            unknown: that sample's root is triangulated, as all are for None.
+
+    Returns: the prediction in the world frame of `cams`. Under a trace, a sample that cannot be solved has
+    `valid` False and finite numbers.
+
+    Raises:
+        ValueError: `params` of another config, inputs that are concrete and wrong, or concrete samples whose
+            cameras and images do not determine where the hand is.
+    """
+    config = V2_BASE if config is None else config
+    network.check_params(config, params)
+    check_inputs(views, cams, root_world, config)
+    frame = enter_working_frame(views, cams, root_world, network.number_type(params))
+    prediction = _predict(params, views, frame, config=config)
+    check_solved(prediction, frame)
+    return prediction
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _predict(params: Params, views: Array, frame: WorkingFrame, *, config: Config) -> Prediction:
+    return network.reconstruct(network.assemble(config, params), views, frame, NormMode())
+
+
+def check_inputs(views: Any, cams: Any, root_world: Any, config: Config) -> None:
+    """Raise `ValueError` that says what, expected, got and fix; the arguments are those of `apply`."""
+    _check_types(views, cams, root_world)
+    _check_views(views, config)
+    if np.shape(cams.K) != (*views.shape[:2], 3, 3):
+        raise ValueError(
+            f"`cams.K` must have shape (batch, view, 3, 3) = {(*views.shape[:2], 3, 3)}, as `views` says; "
+            f"got {np.shape(cams.K)}"
+        )
+    traced = is_traced(views, cams, root_world)
+    if root_world is not None and not traced:
+        _check_root(np.asarray(root_world))
+    check_cameras(cams, config.image_hw, root_world)
+    if not traced:
+        _check_view_counts(cams, root_world)
+        _check_float_images(views, np.asarray(cams.view_mask))
+
+
+def _check_types(views: Any, cams: Any, root_world: Any) -> None:
+    if not isinstance(cams, Cameras):
+        raise ValueError(
+            f"`cams` must be `Cameras(K, T_cam_from_world, view_mask)`; got {type(cams).__name__}. "
+            "Build it with `poem_jax.Cameras`"
+        )
+    arrays = {"views": views, **{f"cams.{name}": leaf for name, leaf in cams._asdict().items()}}
+    if root_world is not None:
+        arrays["root_world"] = root_world
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray | jax.Array):
+            raise ValueError(
+                f"`{name}` must be a NumPy or JAX array; got {type(array).__name__}. "
+                f"Convert it with `numpy.asarray` (images: `numpy.stack`)"
+            )
+
+
+def _check_views(views: Array, config: Config) -> None:
+    shape = np.shape(views)
+    if len(shape) != 5 or shape[2:] != (*config.image_hw, 3):
+        raise ValueError(
+            f"`views` must have shape (batch, view, *{config.image_hw}, 3); got {shape}. "
+            "Crop and resize the images, and adapt K, with `crop_intrinsics`."
+        )
+    if 0 in shape:
+        raise ValueError(f"`views` must hold at least one sample of one view; got shape {shape}")
+    if views.dtype != np.uint8 and "float" not in str(views.dtype):
+        raise ValueError(f"`views` must be uint8, or float in [0, 1]; got {views.dtype}")
+
+
+def _check_view_counts(cams: Cameras, root_world: Array | None) -> None:
+    """A root that is not known needs two cameras at different places."""
+    mask = np.asarray(cams.view_mask)
+    counts = mask.sum(-1)
+    if (counts == 0).any():
+        raise ValueError(
+            f"every sample needs at least one valid view; `cams.view_mask` of samples {_where(counts == 0)} "
+            "is all False. Drop these samples."
+        )
+    unknown = np.isnan(np.full((len(mask), 3), np.nan) if root_world is None else root_world).any(-1)
+    lost = (counts == 1) & unknown
+    if lost.any():
+        raise ValueError(
+            f"a sample with one valid view needs `root_world`, since one view does not fix the root; samples "
+            f"{_where(lost)} have one, and no root. Give `root_world` of shape (batch, 3), or another view."
+        )
+    centre = invert_rigid(fill_masked_views(Cameras(*map(np.asarray, cams))).T_cam_from_world)[..., :3, 3]
+    apart = np.where(mask[..., None], centre - centre[np.arange(len(mask)), mask.argmax(-1)][:, None], 0)
+    lost = (np.abs(apart).max((1, 2)) < MIN_BASELINE) & unknown
+    if lost.any():
+        raise ValueError(
+            "cameras at one place do not fix how far the hand is; in samples "
+            f"{_where(lost)} all valid views stand within {MIN_BASELINE} m. Give each view its own "
+            "`T_cam_from_world`, or `root_world`"
+        )
+
+
+def _check_root(root_world: np.ndarray) -> None:
+    """NaN stands for an unknown root, which two views can triangulate."""
+    unknown = np.isnan(root_world).all(-1)
+    broken = np.asarray(~unknown & ~np.isfinite(root_world).all(-1))
+    if broken.any():
+        raise ValueError(
+            "`root_world` must be finite, or NaN in all three coordinates where the root is unknown; samples "
+            f"{_where(broken)} hold NaN or infinity"
+        )
+
+
+def _check_float_images(views: Array, mask: np.ndarray) -> None:
+    if views.dtype == np.uint8:
+        return
+    low, high = (np.asarray(extreme(views, axis=(2, 3, 4)), np.float32) for extreme in (np.min, np.max))
+    broken = mask & ~np.isfinite(low + high)
+    if broken.any():
+        raise ValueError(f"`views` must be finite; views {_where(broken)} hold NaN or infinity")
+    low, high = low[mask].min(), high[mask].max()
+    if low < 0 or high > 1:
+        raise ValueError(
+            f"float `views` must be in [0, 1]; got values from {low:g} to {high:g}. "
+            "Divide by 255, or pass uint8."
+        )
+
+
+def _where(condition: np.ndarray) -> list:
+    return (
+        np.argwhere(condition).squeeze(-1).tolist()
+        if condition.ndim == 1
+        else np.argwhere(condition).tolist()
+    )
+
+
+def check_solved(prediction: Prediction, frame: WorkingFrame) -> None:
+    """Raise `ValueError` that names the samples whose root is neither known nor determined, and why."""
+    if is_traced(prediction.valid, frame) or np.asarray(prediction.valid).all():
+        return
+    lost = ~np.asarray(prediction.valid)
+    joint = ROOT_JOINT if prediction.keypoints_px.shape[2] == NUM_JOINTS else 0
+    angle = _widest_angle(frame.cams, np.asarray(prediction.keypoints_px, np.float64)[:, :, joint])
+    if (angle[lost] < _PARALLEL).all():
+        raise ValueError(
+            f"the views must see the hand from different directions to fix its distance; in samples "
+            f"{_where(lost)} all rays to the root are parallel, to {angle[lost].max():.2g} rad. Give "
+            "`root_world`, or a view from another side"
+        )
+    raise ValueError(
+        f"the views must look at one hand; in samples {_where(lost)} the rays to its root meet behind a "
+        "camera, or nowhere. Check that images and cameras are in the same order and that "
+        "`T_cam_from_world` maps world to camera, or give `root_world`"
+    )
+
+
+def _widest_angle(cams: Cameras, uv_px: Float[np.ndarray, "batch view 2"]) -> Float[np.ndarray, " batch"]:
+    """Return the widest angle between the rays through one pixel of each view, radians."""
+    K, T_cam_from_primary, mask = (np.asarray(leaf) for leaf in cams)
+    ones = np.ones_like(uv_px[..., :1])
+    ray = np.concatenate([normalised_from_pixels(K, uv_px[:, :, None])[:, :, 0], ones], -1)
+    ray = rotate_points(invert_rigid(T_cam_from_primary)[..., :3, :3], ray[:, :, None])[:, :, 0]
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    sine = np.linalg.norm(np.cross(ray[:, :, None], ray[:, None]), axis=-1)
+    return np.arcsin(np.clip(np.where(mask[:, :, None] & mask[:, None], sine, 0).max((1, 2)), 0, 1))

@@ -1,0 +1,170 @@
+"""Image features of the basis points: a fixed cloud of points about the root (paper, "Point-Embedded
+Intersection Sphere"), the maps that they sample, and codes that tell where a sample comes from.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from poem_jax.geometry.cameras import Cameras, project
+from poem_jax.geometry.sampling import sample_bilinear
+from poem_jax.models.config import (
+    BasisConfig,
+    BasisSampling,
+    BehindCamera,
+    Config,
+    FeatureFusion,
+    PositionCode,
+)
+from poem_jax.models.layers import Conv, ConvNorm, NormMode, TopDownBranch, double_bilinear
+from poem_jax.typing import Array, Bool, Float
+
+_TEMPERATURE = 10000.0
+_EPSILON = 1e-6
+"""Added by the release to the number of views, rows and columns that its positions are divided by."""
+
+
+class FeatureBranch(nnx.Module):
+    """Image features for the basis points, on a map of `config.features.stride`."""
+
+    def __init__(self, config: Config, *, rngs: nnx.Rngs) -> None:
+        trunk, bias, features = config.backbone, config.branch_bias, config.features
+        if features.fusion is FeatureFusion.TOP_DOWN:
+            self.branch = TopDownBranch(trunk.channels, trunk.strides, features.stride, bias=bias, rngs=rngs)
+        else:
+            self.branch = BottomUpBranch(trunk.channels, bias=bias, rngs=rngs)
+        self.project = Conv(self.branch.c_out, config.width, 1, bias=True, rngs=rngs)
+        on_map = features.position_code is PositionCode.VIEW_ROW_COLUMN
+        self.position = ViewRowColumnCode(config.width, rngs=rngs) if on_map else None
+
+    def __call__(self, levels: tuple[Array, ...], mode: NormMode) -> Float[Array, "image h w c"]:
+        """Return the feature maps."""
+        return self.project(self.branch(levels, mode))
+
+    def with_position(
+        self, maps: Float[Array, "batch view h w c"], view_mask: Bool[Array, "batch view"]
+    ) -> Float[Array, "batch view h w c"]:
+        """Add the position code, if it belongs to the map."""
+        return maps if self.position is None else maps + self.position(view_mask, maps.shape[2:4])
+
+
+class BottomUpBranch(nnx.Module):
+    """From the finest map downwards: convolve with stride 2, add the next coarser map; at the end double the
+    resolution once and halve the channels (the release's feature branch)."""
+
+    def __init__(self, channels: tuple[int, ...], *, bias: bool = False, rngs: nnx.Rngs) -> None:
+        self.reductions = nnx.List(
+            ConvNorm(fine, coarse, 3, 2, bias=bias, rngs=rngs)
+            for fine, coarse in itertools.pairwise(channels)
+        )
+        self.c_out = channels[-2]
+        self.squeeze = Conv(channels[-1], self.c_out, 1, bias=True, rngs=rngs)
+
+    def __call__(self, levels: tuple[Array, ...], mode: NormMode) -> Float[Array, "image h w c"]:
+        """Return the map at the second coarsest stride."""
+        x = levels[0]
+        for reduce, coarser in zip(self.reductions, levels[1:], strict=True):
+            x = reduce(x, mode) + coarser
+        return self.squeeze(double_bilinear(x))
+
+
+def basis_points(config: BasisConfig) -> Float[np.ndarray, "basis 3"]:
+    """Draw the basis points, metres about the root; the same for the same config, always."""
+    rng = np.random.Generator(np.random.PCG64(config.seed))
+    inside = np.empty((0, 3))
+    while len(inside) < config.num_points:
+        drawn = _draw(rng, config)
+        inside = np.concatenate([inside, drawn[np.linalg.norm(drawn, axis=-1) <= config.radius]])
+    return inside[: config.num_points].astype(np.float32)
+
+
+def _draw(rng: np.random.Generator, config: BasisConfig) -> Float[np.ndarray, "point 3"]:
+    size = (config.num_points, 3)
+    if config.sampling is BasisSampling.BALL:
+        return rng.uniform(-config.radius, config.radius, size)
+    return rng.normal(0.0, config.radius / 2, size)
+
+
+def projected_features(
+    feature_maps: Float[Array, "batch view h w c"],
+    cams: Cameras,
+    points_world: Float[Array, "batch basis 3"],
+    image_hw: tuple[int, int],
+    behind: BehindCamera = BehindCamera.ZEROS,
+) -> tuple[Float[Array, "batch view basis c"], Float[Array, "batch view basis 2"]]:
+    """Sample every view's features where the points project (paper, eq. 5).
+
+    Points that project outside the image sample zeros.
+
+    Returns: the features, and the projections as shares (u / W, v / H) of the image; zero for points behind
+    the camera, unless `behind` takes these as they are.
+    """
+    uv_px, depth = project(cams.K, cams.T_cam_from_world, points_world[:, None])
+    uv_share = uv_px / jnp.array(image_hw[::-1], uv_px.dtype)
+    cells_wh = jnp.array(feature_maps.shape[-3:-1][::-1], uv_px.dtype)
+    sampled = sample_bilinear(feature_maps, uv_share * cells_wh)
+    if behind is BehindCamera.MIRRORED:
+        return sampled, uv_share
+    seen = (depth > 0)[..., None]
+    return jnp.where(seen, sampled, 0), jnp.where(seen, uv_share, 0)
+
+
+def valid_views_first(
+    maps: Float[Array, "batch view h w c"], cams: Cameras
+) -> tuple[Float[Array, "batch view h w c"], Cameras]:
+    """Bring the valid views of every sample to the front, in their order."""
+    order = jnp.argsort(~cams.view_mask, axis=-1, stable=True)
+    take = jax.vmap(lambda values, i: values[i])
+    return take(maps, order), Cameras(*(take(leaf, order) for leaf in cams))
+
+
+def sine_code(uv_share: Float[Array, "*batch 2"], width: int) -> Float[Array, "*batch c"]:
+    """Encode positions (u / W, v / H) by sines (Carion et al. 2020, DETR).
+
+    y comes before x; sine and cosine of a frequency are interleaved.
+    """
+    half = width // 2
+    frequency = 2 * np.pi * _TEMPERATURE ** (-2.0 * np.arange(half // 2) / half)
+    angle = uv_share[..., ::-1, None] * jnp.asarray(frequency, uv_share.dtype)
+    code = jnp.stack([jnp.sin(angle), jnp.cos(angle)], -1)
+    return code.reshape(*uv_share.shape[:-1], width)
+
+
+class ViewRowColumnCode(nnx.Module):
+    """A code of view number, row and column, mixed to the width of the map (release).
+
+    Positions count from 1 and are divided by their number, which for the views is that of the sample's valid
+    ones. A code is F / 2 sines followed by F / 2 cosines of the same frequencies, F = c / 2.
+    """
+
+    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
+        self.mix = Conv(3 * (width // 2), width, 1, bias=True, rngs=rngs)
+
+    def __call__(
+        self, view_mask: Bool[Array, "batch view"], map_hw: tuple[int, int]
+    ) -> Float[Array, "batch view h w c"]:
+        """Return what is added to each view's map; the mix is linear, so each axis is mixed alone."""
+        assert self.mix.bias is not None
+        to_view, to_row, to_column = jnp.split(self.mix.kernel[...][0, 0], 3)
+        code = len(to_view)
+        view_number = jnp.cumsum(view_mask, -1).astype(to_view.dtype)
+        view_count = jnp.sum(view_mask, -1, keepdims=True).astype(to_view.dtype)
+        views = axis_code(view_number, view_count, code) @ to_view
+        rows, columns = (
+            axis_code(jnp.arange(1.0, size + 1), jnp.array(float(size)), code) @ mix
+            for size, mix in zip(map_hw, (to_row, to_column), strict=True)
+        )
+        return views[:, :, None, None] + rows[:, None] + (columns + self.mix.bias[...])
+
+
+def axis_code(
+    position: Float[Array, "*batch"], size: Float[Array, "*#batch"], width: int
+) -> Float[Array, "*batch c"]:
+    """Encode positions 1 .. size along one axis: sines, then cosines of p / 10000^(2 i / width)."""
+    angle = position / (size + _EPSILON) * (2 * np.pi)
+    period = _TEMPERATURE ** (2.0 * np.arange(width // 2) / width)
+    angle = angle[..., None] / jnp.asarray(period, angle.dtype)
+    return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)
