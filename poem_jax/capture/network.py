@@ -123,10 +123,7 @@ def _predict(
     if not view_mask.any():
         return [None] * len(hands)
     batch = jax.device_get(network.predict(network.prepared, views, cams))
-    return [
-        Prediction(*(None if field is None else field[index] for field in batch._replace(layers_world=None)))
-        for index in range(len(hands))
-    ]
+    return [jax.tree.map(lambda field, i=i: field[i], batch) for i in range(len(hands))]
 
 
 def _result(

@@ -21,7 +21,7 @@ from poem_jax.models.config import (
     NeighbourSearch,
     VectorForm,
 )
-from poem_jax.models.layers import dropout, layer_norm, linear
+from poem_jax.models.layers import dropout, layer_norm, linear, normal
 from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
     Neighbours,
@@ -69,7 +69,7 @@ class Decoder(nnx.Module):
 
     def __init__(self, config: DecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.embeddings = nnx.Param(jax.random.normal(rngs.params(), (NUM_QUERIES, width)))
+        self.embeddings = nnx.Param(normal(rngs.params(), (NUM_QUERIES, width)))
         # The last layer regresses offsets or parameters, never both.
         kinds = [DecoderOutput.OFFSETS] * (config.num_layers - 1) + [config.output]
         self.layers = nnx.List(

@@ -8,7 +8,7 @@ takes a minute. Under a trace JAX draws them: other numbers of the same distribu
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,8 +45,8 @@ class MaskedBatchNorm(nnx.Module):
     """
 
     def __init__(self, channels: int) -> None:
-        self.scale, self.bias = nnx.Param(jnp.ones((channels,))), nnx.Param(jnp.zeros((channels,)))
-        self.mean, self.variance = nnx.BatchStat(jnp.zeros((channels,))), nnx.BatchStat(jnp.ones((channels,)))
+        self.scale, self.bias = nnx.Param(filled(1.0, channels)), nnx.Param(filled(0.0, channels))
+        self.mean, self.variance = nnx.BatchStat(filled(0.0, channels)), nnx.BatchStat(filled(1.0, channels))
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h w c"]:
         """Normalise; in training also move the running statistics."""
@@ -91,7 +91,7 @@ class Conv(nnx.Module):
     ) -> None:
         self.stride, self.size = stride, size
         self.kernel = nnx.Param(he_normal(rngs.params(), (size, size, c_in, c_out)))
-        self.bias = nnx.Param(jnp.zeros((c_out,))) if bias else None
+        self.bias = nnx.Param(filled(0.0, c_out)) if bias else None
 
     def __call__(self, x: Float[Array, "image h w c"]) -> Float[Array, "image h2 w2 c2"]:
         """Convolve."""
@@ -217,20 +217,25 @@ def dropout(x: Float[Array, "*shape"], rate: float, key: PRNGKeyArray | None) ->
     return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0)
 
 
-def standard_normal(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:
-    """Draw from N(0, 1)."""
+def filled(value: float, channels: int) -> Float[Array, " c"]:
+    """Return equal numbers; through NumPy, which compiles nothing for it."""
+    return jnp.asarray(np.full((channels,), value, np.float32))
+
+
+def normal(key: PRNGKeyArray, shape: tuple[int, ...], scale: float = 1.0) -> Float[Array, "*shape"]:
+    """Draw from a normal distribution with standard deviation `scale`."""
     if isinstance(key, Tracer):
-        return jax.random.normal(key, shape, jnp.float32)
-    return jnp.asarray(_numpy_generator(key).standard_normal(shape, np.float32))
+        return scale * jax.random.normal(key, shape, jnp.float32)
+    return jnp.asarray(scale * _numpy_generator(key).standard_normal(shape, np.float32))
 
 
 def he_normal(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:
     """Draw weights (..., c_out) from N(0, 2 / fan-in) (He et al. 2015)."""
-    return math.sqrt(2 / math.prod(shape[:-1])) * standard_normal(key, shape)
+    return normal(key, shape, math.sqrt(2 / math.prod(shape[:-1])))
 
 
 def xavier_uniform(
-    key: PRNGKeyArray, shape: tuple[int, int], dtype: jnp.dtype = jnp.float32
+    key: PRNGKeyArray, shape: tuple[int, int], dtype: Any = jnp.float32
 ) -> Float[Array, "c_in c_out"]:
     """Draw weights uniformly with variance 2 / (fan-in + fan-out) (Glorot and Bengio 2010)."""
     limit = math.sqrt(6 / sum(shape))

@@ -61,6 +61,29 @@ class Constant(nnx.Variable):
     """An array that is stored with the weights and never trained."""
 
 
+class StaticArray(np.ndarray):
+    """Indices or flags among the constants: an array to all who read it, but no leaf of a pytree, so that
+    nothing differentiates, casts or traces it."""
+
+
+jax.tree_util.register_pytree_node(
+    StaticArray, lambda array: ((), _ByValue(array)), lambda by_value, _: by_value.array
+)
+
+
+class _ByValue:
+    """What `jit` compares to know a static array again."""
+
+    def __init__(self, array: StaticArray) -> None:
+        self.array, self.key = array, (array.dtype.str, array.shape, array.tobytes())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByValue) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
 GROUPS = {"trainable": nnx.Param, "statistics": nnx.BatchStat, "constants": Constant}
 """Which kind of variable each part of `params` holds."""
 
@@ -79,7 +102,7 @@ class HandConstants(nnx.Module):
 
     def __init__(self, hand: HandModel) -> None:
         for name, value in hand._asdict().items():
-            setattr(self, name, Constant(jnp.asarray(value)))
+            setattr(self, name, Constant(np.asarray(value)))
 
     def model(self) -> HandModel:
         """Return them as a `HandModel`."""
@@ -94,8 +117,8 @@ class AnchorConstants(nnx.Module):
 
     def __init__(self, config: Config, template: Float[np.ndarray, "799 3"]) -> None:
         index = farthest_points(template, config.decoder.num_neighbours)
-        self.index = Constant(jnp.asarray(index))
-        self.positions = Constant(jnp.asarray(template[index] / config.basis.radius, jnp.float32))
+        self.index = Constant(index)
+        self.positions = Constant(np.asarray(template[index] / config.basis.radius, np.float32))
 
     def values(self) -> Anchors:
         """Return them."""
@@ -272,7 +295,23 @@ def build(config: Config, rngs: nnx.Rngs) -> Poem:
 
 def split(model: Poem) -> Params:
     """Return the model's arrays."""
-    return {group: _nested(nnx.to_flat_state(nnx.state(model, kind))) for group, kind in GROUPS.items()}
+    params = {group: _nested(nnx.to_flat_state(nnx.state(model, kind))) for group, kind in GROUPS.items()}
+    return with_static_indices(params)
+
+
+def with_static_indices(params: Params) -> Params:
+    """Make indices and flags among the constants static, so that `jax.grad` works on `params`."""
+
+    def static(leaf: Array) -> Array:
+        return leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else np.asarray(leaf).view(StaticArray)
+
+    return {**params, "constants": jax.tree.map(static, params["constants"])}
+
+
+def leaves_with_names(tree: Any) -> dict[str, Array]:
+    """List the arrays of a pytree by dotted path, static ones too."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda leaf: isinstance(leaf, StaticArray))
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def statistics(model: Poem) -> dict[str, Any]:
@@ -336,5 +375,4 @@ def _at(tree: dict[str, Any], path: tuple) -> Array:
 
 
 def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    return {"/".join(str(part.key) for part in path): np.shape(leaf) for path, leaf in leaves}
+    return {name: np.shape(leaf) for name, leaf in leaves_with_names(params).items()}

@@ -19,7 +19,7 @@ from orbax.checkpoint import v1 as ocp
 from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.models.config import Config
 from poem_jax.models.config_json import from_json, to_json
-from poem_jax.models.network import describe
+from poem_jax.models.network import StaticArray, describe, leaves_with_names, with_static_indices
 from poem_jax.typing import Array, Params, PyTree
 
 CONFIG_FILE = "config.json"
@@ -108,9 +108,8 @@ def load(path: str | os.PathLike, *, expected: Config | None = None) -> tuple[Co
     template = expected_leaves(config)
     check_leaves(stored, template, f"checkpoint at {path}")
     _check_finite(stored, f"checkpoint at {path}")
-    return config, unflatten(
-        {name: jnp.asarray(stored[name], template[name].dtype) for name in template}, _abstract(config)
-    )
+    leaves = {name: jnp.asarray(stored[name], template[name].dtype) for name in template}
+    return config, with_static_indices(unflatten(leaves, describe(config)))
 
 
 def shipped() -> tuple[Config, Params]:
@@ -120,18 +119,25 @@ def shipped() -> tuple[Config, Params]:
 
 def flatten(tree: PyTree) -> dict[str, Array]:
     """List the leaves of a pytree by dotted path."""
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    leaves = leaves_with_names(tree)
+    return {
+        name: np.asarray(leaf) if isinstance(leaf, StaticArray) else leaf for name, leaf in leaves.items()
+    }
 
 
 def unflatten(leaves: dict[str, Array], like: PyTree) -> PyTree:
-    """Put leaves back into a pytree of the structure of `like`."""
-    return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in flatten(like)])
+    """Put leaves back into a pytree of the structure of `like`; what is static there is static."""
+    filled = [
+        np.asarray(leaves[name]).view(StaticArray) if isinstance(leaf, StaticArray) else leaves[name]
+        for name, leaf in leaves_with_names(like).items()
+    ]
+    structure = jax.tree.structure(like, is_leaf=lambda leaf: isinstance(leaf, StaticArray))
+    return jax.tree.unflatten(structure, filled)
 
 
 def expected_leaves(config: Config) -> dict[str, jax.ShapeDtypeStruct]:
     """Return shape and dtype of every parameter of a model, without computing any."""
-    return flatten(_abstract(config))
+    return flatten(describe(config))
 
 
 def check_leaves(stored: dict[str, Any], template: dict[str, Any], what: str) -> None:
@@ -179,10 +185,6 @@ def _check_finite(leaves: dict[str, Any], what: str) -> None:
             f"{what}: {len(broken)} arrays hold NaN or infinity: {', '.join(broken[:8])}. "
             "All weights must be finite; take those from before the training failed"
         )
-
-
-def _abstract(config: Config) -> PyTree:
-    return describe(config)
 
 
 def _narrowed(name: str, leaf: np.ndarray, dtype: Any) -> np.ndarray:

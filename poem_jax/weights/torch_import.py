@@ -21,7 +21,7 @@ from poem_jax.hand.topology import (
 )
 from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
 from poem_jax.models.hand_output import template_queries
-from poem_jax.models.network import describe
+from poem_jax.models.network import describe, with_static_indices
 from poem_jax.models.presets import preset
 from poem_jax.typing import Float, Int, Params
 from poem_jax.weights.entries import read_entries, write_entries
@@ -329,6 +329,5 @@ def _params(config: Config, leaves: dict[str, np.ndarray]) -> Params:
     template = expected_leaves(config)
     missing = template.keys() - leaves.keys()
     assert not missing, f"the table fills no {sorted(missing)}"
-    return unflatten(
-        {name: leaves[name].astype(leaf.dtype) for name, leaf in template.items()}, describe(config)
-    )
+    typed = {name: leaves[name].astype(leaf.dtype) for name, leaf in template.items()}
+    return with_static_indices(unflatten(typed, describe(config)))

@@ -46,7 +46,7 @@ class Recorder:
             "joints_world": np.zeros((number, 21, 3)) + places[:, None],
             "root_world": places,
             "keypoints_px": np.full((*views.shape[:2], 1, 2), 20.0),
-            "layers_world": np.zeros((1, number, 799, 3)),
+            "layers_world": np.zeros((number, 1, 799, 3)),
             "valid": cams.view_mask.any(-1),
         }
         return Prediction(**{**known, **self.answer(views, cams)})
