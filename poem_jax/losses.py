@@ -79,7 +79,7 @@ class LossRecipe:
 
 
 RELEASE = LossRecipe("release")
-"""The released training code: the last layer only (FACTS section 10)."""
+"""The released training code: the last layer only."""
 
 PAPER = LossRecipe("paper", layers=Layers.EVERY, pose_space=PoseSpace.ROTATION)
 """The release's weights on every layer, summed; poses are compared as rotations, since axis-angle wraps."""
@@ -143,7 +143,7 @@ def multi_view_losses(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Compute the weighted training loss and its unweighted terms.
 
-    The terms are the release's (FACTS section 10): `keypoints`, `joints`, `regressed_joints`, `vertices`,
+    The terms are the release's: `keypoints`, `joints`, `regressed_joints`, `vertices`,
     `reprojection`, and for parametric predictions `pose` and `shape`. L1 terms are taken in the primary
     camera's frame, so that no choice of the world frame changes the loss.
 
@@ -322,7 +322,7 @@ def _parametric_terms(
 
 
 def released_axis_angle(rotations: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
-    """Return the axis-angle vectors that the released parametric model compares (FACTS section 7).
+    """Return the axis-angle vectors that the released parametric model compares.
 
     They come from the quaternion whose largest component is positive, so that an angle may exceed pi: the
     rotation that `axis_angle_from_rotation` gives too, but another number in a loss.

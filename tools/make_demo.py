@@ -54,7 +54,7 @@ def draw_picture(dataset: SyntheticDataset, scene: Scene, view: int, box: np.nda
         scene,
         K=crop_intrinsics(at.K_frame[view], box, hw),
         T_cam_from_world=at.T_cam_from_world[view],
-        frame=corners[:, :2].ravel(),
+        full_frame=corners[:, :2].ravel(),
         exposure=exposure,
         background=dataset.backgrounds[exposure.background],
         hw=hw,

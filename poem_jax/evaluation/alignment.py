@@ -3,7 +3,7 @@
 import numpy as np
 
 from poem_jax.evaluation.protocols import PROCRUSTES_EPSILON, SCALE_JOINT
-from poem_jax.geometry.alignment import Similarity, apply_similarity, procrustes
+from poem_jax.geometry.alignment import SimilarityTransform, apply_similarity, procrustes
 from poem_jax.geometry.transforms import rotate_points
 from poem_jax.hand.topology import WRIST
 from poem_jax.typing import Float
@@ -11,7 +11,7 @@ from poem_jax.typing import Float
 
 def fit_similarity(
     pred: Float[np.ndarray, "sample point 3"], gt: Float[np.ndarray, "sample point 3"]
-) -> Similarity:
+) -> SimilarityTransform:
     """Fit rotation *or reflection*, scale and shift from each prediction to its ground truth.
 
     All four evaluators divide both centred sets by (Frobenius norm + 1e-8) and multiply by the ground truth's

@@ -13,7 +13,7 @@ from poem_jax.geometry.transforms import matmul, rotate_points, transpose
 from poem_jax.typing import Array, Bool, Float, array_namespace
 
 
-class Similarity(NamedTuple):
+class SimilarityTransform(NamedTuple):
     """The map target = scale * R source + t."""
 
     R: Float[Array, "*batch 3 3"]
@@ -30,7 +30,7 @@ def procrustes(
     with_scale: bool = True,
     norm_epsilon: float = 0.0,
     mask: Bool[Array, "*batch point"] | None = None,
-) -> Similarity:
+) -> SimilarityTransform:
     """Return the similarity that takes `source` closest to `target` in the sense of least squares.
 
     Args:
@@ -54,11 +54,11 @@ def procrustes(
     R = nearest_rotation(M, allow_reflection=allow_reflection)
     scale = _scale(R, M, X, norm_epsilon) if with_scale else xp.ones_like(M[..., 0, 0])
     t = target_mean - scale[..., None] * rotate_points(R, source_mean[..., None, :])[..., 0, :]
-    return Similarity(R, scale, t)
+    return SimilarityTransform(R, scale, t)
 
 
 def apply_similarity(
-    similarity: Similarity, points: Float[Array, "*#batch point 3"]
+    similarity: SimilarityTransform, points: Float[Array, "*#batch point 3"]
 ) -> Float[Array, "*#batch point 3"]:
     """Map points of the source's frame to the target's."""
     turned = rotate_points(similarity.R, points)

@@ -18,7 +18,7 @@ _FINGERS = NUM_SKELETON_JOINTS - 1
 FINGER_NUMBERS = 3 * _FINGERS
 
 
-class PoseSpace(NamedTuple):
+class PoseComponents(NamedTuple):
     """Principal components of finger poses, of one side."""
 
     mean: Float[Array, "45"]
@@ -61,7 +61,7 @@ def to_smplx(pose: Float[Array, "*batch 16 3"], right_mean: Float[Array, "45"], 
 
     Args:
         pose: axis-angle, MANO order, zero = flat hand, of a hand of `side`.
-        right_mean: MANO's `hands_mean` of the right hand (`load_pose_space(path).mean`).
+        right_mean: MANO's `hands_mean` of the right hand (`load_pose_components(path).mean`).
         side: "right" or "left". Shape and translation are the same in both conventions.
 
     Raises: ValueError: another side.

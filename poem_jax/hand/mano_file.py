@@ -3,7 +3,7 @@
 The pickles were written by Python 2 and hold chumpy variables and a scipy sparse matrix. Neither library is
 needed, nor is the pickle trusted: `io/safe_pickle.py` keeps their state in inert stand-ins, and the arrays
 are taken out here. MANO's mean pose is not used in the hand: as in the released models, zero pose means the
-flat hand; `load_pose_space` reads it for conversions.
+flat hand; `load_pose_components` reads it for conversions.
 
 The `MANO_LEFT.pkl` that was published has a known fault: the x components of its `shapedirs` were not
 mirrored with the hand, so that shape coefficients which should lengthen the fingers shorten them. It is
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from poem_jax.hand.conventions import FINGER_NUMBERS, PoseSpace
+from poem_jax.hand.conventions import FINGER_NUMBERS, PoseComponents
 from poem_jax.hand.mano_pickle import as_array
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import (
@@ -40,7 +40,7 @@ _SHAPES = {
     "weights": (NUM_VERTICES, NUM_SKELETON_JOINTS),
     "f": (NUM_FACES, 3),
 }
-_POSE_SPACE_SHAPES = {
+_COMPONENT_SHAPES = {
     "hands_mean": (FINGER_NUMBERS,),
     "hands_components": (FINGER_NUMBERS, FINGER_NUMBERS),
 }
@@ -72,17 +72,17 @@ def load(path: str | Path, side: str | None = None) -> HandModel:
     return _hand_model(_read(Path(path)), str(path), side)
 
 
-def load_pose_space(path: str | Path) -> PoseSpace:
+def load_pose_components(path: str | Path) -> PoseComponents:
     """Read the mean pose and the principal components of a hand in MANO's schema.
 
     Raises:
         FileNotFoundError, ValueError: as `load`, or the file lacks `hands_mean` or `hands_components`.
     """
     fields = _read(Path(path))
-    missing = [name for name in _POSE_SPACE_SHAPES if name not in fields]
+    missing = [name for name in _COMPONENT_SHAPES if name not in fields]
     if missing:
-        raise ValueError(f"{path} must have {', '.join(_POSE_SPACE_SHAPES)}; missing: {', '.join(missing)}")
-    return PoseSpace(*(_checked(name, fields[name], str(path)) for name in _POSE_SPACE_SHAPES))
+        raise ValueError(f"{path} must have {', '.join(_COMPONENT_SHAPES)}; missing: {', '.join(missing)}")
+    return PoseComponents(*(_checked(name, fields[name], str(path)) for name in _COMPONENT_SHAPES))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _agreement_of_length_and_width(v_template: np.ndarray, shapedirs: np.ndarray
 def _checked(name: str, value: Any, source: str) -> np.ndarray:
     """Return one field as a finite array of its type and shape."""
     array = _array(name, value, source)
-    expected = {**_SHAPES, **_POSE_SPACE_SHAPES}[name]
+    expected = {**_SHAPES, **_COMPONENT_SHAPES}[name]
     if array is None or array.dtype.kind not in "fiu":
         raise ValueError(f"`{name}` in {source} must be an array of numbers {expected}; got {_kind(value)}")
     if array.shape != expected:

@@ -16,8 +16,17 @@ from poem_jax.hand.topology import NUM_FACES, NUM_JOINTS, NUM_VERTICES
 from poem_jax.render.zbuffer import draw_faces, empty_buffers
 from poem_jax.synthetic.backgrounds import SIZE, make_backgrounds
 from poem_jax.synthetic.config import SyntheticConfig
-from poem_jax.synthetic.scene import Body, Light, Mesh, build_mesh, cast_shadows, draw_body, draw_light, study
-from poem_jax.synthetic.sensor import Exposure, draw_exposures, take_picture, warp_background
+from poem_jax.synthetic.scene import (
+    Body,
+    Light,
+    Mesh,
+    build_mesh,
+    cast_shadows,
+    draw_body,
+    draw_light,
+    prepare_hand,
+)
+from poem_jax.synthetic.sensor import Exposure, develop_picture, draw_exposures, warp_background
 from poem_jax.synthetic.shading import (
     count_samples,
     cover,
@@ -90,7 +99,7 @@ class SyntheticDataset:
 
             hand = default_hand()
         self.config, self.seed = config, seed
-        self.anatomy = study(hand)
+        self.prepared = prepare_hand(hand)
         self.backgrounds = make_backgrounds(seed, config.num_backgrounds)
 
     def __getitem__(self, index: int) -> MultiViewBatch:
@@ -116,7 +125,7 @@ class SyntheticDataset:
         """Draw everything of a sample but its pictures."""
         config = self.config
         rng = self._stream(index, _SCENE)
-        body = draw_body(self.anatomy, config.body, rng)
+        body = draw_body(self.prepared, config.body, rng)
         joints = body.joints_world.astype(np.float64)
         viewpoints = draw_viewpoints(
             config.cameras,
@@ -126,7 +135,7 @@ class SyntheticDataset:
             config.num_views,
             config.image_hw,
         )
-        mesh = build_mesh(self.anatomy, body, viewpoints.camera_world, config, rng)
+        mesh = build_mesh(self.prepared, body, viewpoints.camera_world, config, rng)
         light = draw_light(config.light, rng)
         sensors = self._stream(index, _SENSORS)
         exposures = draw_exposures(config.sensor, sensors, config.num_views, len(self.backgrounds), SIZE)
@@ -151,7 +160,7 @@ class SyntheticDataset:
             scene,
             K=at.K_crop[view],
             T_cam_from_world=at.T_cam_from_world[view],
-            frame=at.frame_in_crop[view],
+            full_frame=at.frame_in_crop[view],
             exposure=scene.exposures[view],
             background=self.backgrounds[scene.exposures[view].background],
             hw=self.config.image_hw,
@@ -164,7 +173,7 @@ def render_view(
     *,
     K: Float[Array, "3 3"],
     T_cam_from_world: Float[Array, "4 4"],
-    frame: Float[Array, "4"],
+    full_frame: Float[Array, "4"],
     exposure: Exposure,
     background: UInt8[Array, "side side 3"],
     hw: tuple[int, int],
@@ -176,7 +185,7 @@ def render_view(
         scene: what to draw.
         K: intrinsics of the image to draw, float32 values (any float type).
         T_cam_from_world: extrinsics.
-        frame: the full frame's extent in the image's pixels; beyond it the image is black.
+        full_frame: the full frame's extent in the image's pixels; beyond it the image is black.
         exposure: the camera's settings.
         background: texture behind everything.
         hw: size of the image.
@@ -192,7 +201,7 @@ def render_view(
     before = count_samples(face_index, NUM_FACES)
     draw_faces(points, mesh.faces[body:], body, True, NEAR_M, face_index, inverse_depth)
     coverage = np.empty(hw, np.float32)
-    after = cover(face_index, NUM_FACES, scale, frame, coverage)
+    after = cover(face_index, NUM_FACES, scale, full_frame, coverage)
 
     image = np.empty((*hw, 3), np.float32)
     center = -T[:3, :3].T @ T[:3, 3]
@@ -200,16 +209,16 @@ def render_view(
     surface = (mesh.faces, mesh.face_material, scene.attributes, mesh.materials)
     lighting = (*scene.light, center.astype(np.float32))
     raster = (points, face_index, inverse_depth)
-    shade_over(surface, lighting, raster, scale, frame, behind, tones, image)
+    shade_over(surface, lighting, raster, scale, full_frame, behind, tones, image)
 
     hand_px, joints_px = points[:NUM_VERTICES], np.empty((NUM_JOINTS, 3))
     project_points(K, T, scene.body.joints_world, float(scale), joints_px)
     seen, joint_seen = np.empty(NUM_VERTICES, bool), np.empty(NUM_JOINTS, bool)
-    vertices_seen(hand_px, inverse_depth, scale, frame, _SURFACE_TOLERANCE_M, seen)
-    vertices_seen(joints_px, inverse_depth, scale, frame, _JOINT_TOLERANCE_M, joint_seen)
+    vertices_seen(hand_px, inverse_depth, scale, full_frame, _SURFACE_TOLERANCE_M, seen)
+    vertices_seen(joints_px, inverse_depth, scale, full_frame, _JOINT_TOLERANCE_M, joint_seen)
     inside = ((hand_px[:, :2] >= 0) & (hand_px[:, :2] < np.array(hw[::-1]) * scale)).all(-1).mean()
     hidden = 1 - inside * (after / before if before else 0.0)
-    return _View(take_picture(image, exposure), coverage, float(hidden), seen, joint_seen)
+    return _View(develop_picture(image, exposure), coverage, float(hidden), seen, joint_seen)
 
 
 def _rounded(matrix: Array) -> Array:

@@ -12,7 +12,7 @@ from poem_jax.hand.joint_limits import ANGLE_NAMES as ANGLE_NAMES
 from poem_jax.hand.joint_limits import LIMITS_DEG, NUM_BENDING_JOINTS, POSE_LIMITS, anatomical_axes
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import MANO_FINGER_NAMES
-from poem_jax.synthetic.clearance import clearance, posed_fingers
+from poem_jax.synthetic.finger_collisions import posed_fingers, smallest_gap
 from poem_jax.typing import Array, Float
 
 FAMILIES = ("fist", "pinch", "counting", "flat", "grasp", "random", "point")
@@ -141,7 +141,7 @@ def _best_of(angles: np.ndarray, pinch: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Pick the best candidate (n, candidates, 15, 3) of each sample; return it and its score."""
     count = angles.shape[1]
     fingers = posed_fingers(angles_to_pose(angles.reshape(-1, NUM_BENDING_JOINTS, 3)))
-    gap = clearance(fingers)
+    gap = smallest_gap(fingers)
     # A pinch closes: the nearer the thumb comes to another finger's tip, the better.
     thumb = MANO_FINGER_NAMES.index("thumb")
     tips = fingers[:, :, -1]

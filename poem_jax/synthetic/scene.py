@@ -36,7 +36,7 @@ _USUAL_POWER = 0.65
 """Light power at which exposure is left alone."""
 
 
-class Anatomy(NamedTuple):
+class PreparedHand(NamedTuple):
     """What every scene of one hand shares."""
 
     hand: HandModel
@@ -94,36 +94,36 @@ class Placed(NamedTuple):
     material: Float[Array, " c"]
 
 
-def study(hand: HandModel) -> Anatomy:
+def prepare_hand(hand: HandModel) -> PreparedHand:
     """Find once what every scene of this hand needs: wrist loop, forearm faces, skin map."""
     faces = np.ascontiguousarray(hand.faces, dtype=np.int32)
     template = np.asarray(hand.v_template, np.float64)
     normals = np.empty_like(template)
     vertex_normals(template, faces, normals)
     loop = wrist_loop(faces)
-    return Anatomy(hand, faces, loop, forearm_faces(loop, NUM_VERTICES), map_skin(hand, normals))
+    return PreparedHand(hand, faces, loop, forearm_faces(loop, NUM_VERTICES), map_skin(hand, normals))
 
 
-def draw_body(anatomy: Anatomy, config: BodyConfig, rng: np.random.Generator) -> Body:
+def draw_body(prepared: PreparedHand, config: BodyConfig, rng: np.random.Generator) -> Body:
     """Draw pose, shape and place; ground truth is rounded to float32, and everything is built on that."""
     pose = np.array(sample_pose(rng, 1)[0], np.float32)
     pose[WRIST] = axis_angle_from_rotation(random_rotation(rng))
     shape = (config.shape_sigma * rng.standard_normal(NUM_SHAPES)).astype(np.float32)
     place = rng.uniform(*config.world_offset_m, 3).astype(np.float32)
-    mesh = hand_mesh(anatomy.hand, pose, shape, translation=place, center_joint=ROOT_JOINT)
+    mesh = hand_mesh(prepared.hand, pose, shape, translation=place, center_joint=ROOT_JOINT)
     return Body(pose, shape, np.asarray(mesh.vertices, np.float32), np.asarray(mesh.joints, np.float32))
 
 
 def build_mesh(
-    anatomy: Anatomy,
+    prepared: PreparedHand,
     body: Body,
     cameras_world: Float[Array, "view 3"],
     config: SyntheticConfig,
     rng: np.random.Generator,
 ) -> Mesh:
     """Put forearm, skin and occluding objects around a hand; shadows are not yet cast."""
-    vertices, normals, albedo, faces = _flesh(anatomy, body, config.body, rng)
-    side = -1.0 if bool(anatomy.hand.is_left) else 1.0
+    vertices, normals, albedo, faces = _flesh(prepared, body, config.body, rng)
+    side = -1.0 if bool(prepared.hand.is_left) else 1.0
     objects = _draw_objects(body, side, cameras_world, config.occluders, rng)
     first = np.cumsum([len(vertices), *(len(o.solid.vertices) for o in objects)])
     every = [o.solid for o in objects]
@@ -186,25 +186,25 @@ def random_rotation(rng: np.random.Generator) -> Float[Array, "3 3"]:
 
 
 def _flesh(
-    anatomy: Anatomy, body: Body, config: BodyConfig, rng: np.random.Generator
+    prepared: PreparedHand, body: Body, config: BodyConfig, rng: np.random.Generator
 ) -> tuple[Array, Array, Array, Array]:
     """Return vertices, normals, colours and faces of hand and forearm."""
     hand = body.vertices_world.astype(np.float64)
     arm = grow_forearm(
-        hand[anatomy.loop],
+        hand[prepared.loop],
         body.joints_world[ROOT_JOINT].astype(np.float64),
-        anatomy.arm_faces,
+        prepared.arm_faces,
         length=rng.uniform(*config.forearm_length_m),
         bend=np.radians(rng.uniform(*config.forearm_bend_deg)) * directions_on_sphere(*rng.random(2)),
         taper=rng.uniform(*config.forearm_taper),
         sleeve=bool(rng.random() < config.sleeve_probability),
     )
     vertices = np.concatenate([hand, arm.vertices])
-    faces = np.concatenate([anatomy.faces, arm.faces])
+    faces = np.concatenate([prepared.faces, arm.faces])
     normals = np.empty_like(vertices)
     vertex_normals(vertices, faces, normals)
-    ring = np.resize(anatomy.skin.rest[anatomy.loop], arm.offsets.shape)
-    albedo = skin_colors(anatomy.skin, np.concatenate([anatomy.skin.rest, ring + arm.offsets]), rng)
+    ring = np.resize(prepared.skin.rest[prepared.loop], arm.offsets.shape)
+    albedo = skin_colors(prepared.skin, np.concatenate([prepared.skin.rest, ring + arm.offsets]), rng)
     albedo[NUM_VERTICES:] += arm.sleeve[:, None] * (rng.uniform(0, 1, 3) ** 1.8 - albedo[NUM_VERTICES:])
     return vertices, normals, albedo, faces
 

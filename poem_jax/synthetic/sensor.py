@@ -12,7 +12,7 @@ from poem_jax.typing import Array, Float, UInt8
 
 _NUMBERS = 20
 _CURVE_STEPS = 1024
-_LEAST_BLUR_PX = 0.3
+_MIN_BLUR_PX = 0.3
 
 
 class Exposure(NamedTuple):
@@ -52,9 +52,9 @@ def warp_background(
     return behind, ((np.arange(256)[:, None] / 255) ** 2 * exposure.background_gain).astype(np.float32)
 
 
-def take_picture(light: Float[Array, "h w 3"], exposure: Exposure) -> UInt8[Array, "h w 3"]:
+def develop_picture(light: Float[Array, "h w 3"], exposure: Exposure) -> UInt8[Array, "h w 3"]:
     """Turn an image of linear light (float32) into what a camera's file would hold."""
-    if exposure.blur_px >= _LEAST_BLUR_PX:
+    if exposure.blur_px >= _MIN_BLUR_PX:
         light = cv2.GaussianBlur(light, (0, 0), exposure.blur_px)
     if exposure.motion_px > 1:
         light = cv2.filter2D(light, -1, _smear(exposure.motion_px, exposure.motion_angle))

@@ -4,14 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.hand.conventions import PoseSpace, SmplxHand, from_smplx, to_smplx
-from poem_jax.hand.mano_file import load, load_pose_space
+from poem_jax.hand.conventions import PoseComponents, SmplxHand, from_smplx, to_smplx
+from poem_jax.hand.mano_file import load, load_pose_components
 from poem_jax.hand.model import hand_mesh, mirror, mirror_pose
 from poem_jax.hand.template import default_hand
 
 RNG = np.random.default_rng(0)
 POSE = RNG.normal(scale=0.4, size=(3, 16, 3)).astype(np.float32)
-SPACE = PoseSpace(
+SPACE = PoseComponents(
     RNG.normal(scale=0.2, size=45).astype(np.float32),
     np.linalg.qr(RNG.normal(size=(45, 45)))[0].astype(np.float32),
 )
@@ -76,10 +76,10 @@ def test_the_pose_space_is_read_from_a_file(tmp_path):
     fields = {"f" if name == "faces" else name: value for name, value in hand.items() if name != "is_left"}
     path = tmp_path / "hand.npz"
     np.savez(path, **fields, hands_mean=SPACE.mean, hands_components=SPACE.components)
-    found = load_pose_space(path)
+    found = load_pose_components(path)
     np.testing.assert_array_equal(found.mean, SPACE.mean)
     np.testing.assert_array_equal(found.components, SPACE.components)
     assert load(path).side == "right"
     np.savez(path, **fields, hands_mean=SPACE.mean)
     with pytest.raises(ValueError, match="missing: hands_components"):
-        load_pose_space(path)
+        load_pose_components(path)

@@ -69,7 +69,7 @@ def octant_shares(directions):
 
 def test_every_joint_angle_spreads_over_its_limits(dataset):
     rng = np.random.default_rng(0)
-    poses = np.stack([draw_body(dataset.anatomy, dataset.config.body, rng).pose for _ in range(1000)])
+    poses = np.stack([draw_body(dataset.prepared, dataset.config.body, rng).pose for _ in range(1000)])
     spread = pose_to_angles(poses).std(0)
     uniform = (POSE_LIMITS[..., 1] - POSE_LIMITS[..., 0]) / np.sqrt(12)
     assert (spread >= 0.5 * uniform).all()

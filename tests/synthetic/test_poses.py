@@ -6,7 +6,7 @@ from poem_jax.hand.joint_limits import resting_fingers
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import BONES, SKELETON_JOINT_NAMES
-from poem_jax.synthetic.clearance import clearance, posed_fingers, segment_distance
+from poem_jax.synthetic.finger_collisions import posed_fingers, segment_distance, smallest_gap
 from poem_jax.synthetic.poses import (
     ANGLE_NAMES,
     FAMILIES,
@@ -152,7 +152,7 @@ def test_unknown_families_are_named(rng):
 
 def test_samples_keep_their_fingers_apart(rng):
     fingers = posed_fingers(sample_pose(rng, 500))
-    assert (clearance(fingers) >= 0).mean() > 0.99
+    assert (smallest_gap(fingers) >= 0).mean() > 0.99
 
 
 def test_capsule_skeleton_is_the_hands(rng):
@@ -166,12 +166,12 @@ def test_capsule_skeleton_is_the_hands(rng):
     assert len(BONES) == 20
 
 
-def test_clearance_sees_a_finger_in_another():
+def test_the_smallest_gap_sees_a_finger_in_another():
     rest = resting_fingers(default_hand())[None]
-    assert clearance(rest)[0] > 0
+    assert smallest_gap(rest)[0] > 0
     crossed = rest.copy()
     crossed[0, 0] = crossed[0, 1] + np.array([0, 0, 0.004])
-    assert clearance(crossed)[0] < 0
+    assert smallest_gap(crossed)[0] < 0
 
 
 def test_segment_distance_matches_a_dense_search(rng):

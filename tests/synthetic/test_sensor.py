@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from poem_jax.synthetic.config import SensorConfig
-from poem_jax.synthetic.sensor import draw_exposures, take_picture, warp_background
+from poem_jax.synthetic.sensor import develop_picture, draw_exposures, warp_background
 
 
 def draw(num_views, config=None, seed=0):
@@ -40,7 +40,7 @@ def test_settings_stay_within_their_ranges():
 
 def test_an_ideal_sensor_keeps_the_light():
     light = np.random.default_rng(0).uniform(0, 1, (16, 16, 3)).astype(np.float32)
-    np.testing.assert_allclose(take_picture(light, draw(1, IDEAL)[0]), 255 * light, atol=1)
+    np.testing.assert_allclose(develop_picture(light, draw(1, IDEAL)[0]), 255 * light, atol=1)
 
 
 def test_blur_and_motion_keep_the_mean():
@@ -48,7 +48,7 @@ def test_blur_and_motion_keep_the_mean():
     light[16, 16] = 1
     sharp = draw(1, IDEAL)[0]
     for exposure in (sharp._replace(blur_px=1.0), sharp._replace(motion_px=5, motion_angle=0.7)):
-        picture = take_picture(light * 0.999, exposure._replace(gains=np.full(3, 1.0)))
+        picture = develop_picture(light * 0.999, exposure._replace(gains=np.full(3, 1.0)))
         assert 0 < picture.max() < 200
         assert picture.sum() == pytest.approx(3 * 255, rel=0.25)
 
@@ -56,7 +56,7 @@ def test_blur_and_motion_keep_the_mean():
 def test_jpeg_keeps_colours_in_their_channels():
     light = np.zeros((32, 32, 3), np.float32)
     light[..., 0], light[..., 1] = 0.8, 0.3
-    picture = take_picture(light, draw(1, IDEAL)[0]._replace(jpeg_quality=90))
+    picture = develop_picture(light, draw(1, IDEAL)[0]._replace(jpeg_quality=90))
     np.testing.assert_allclose(picture.mean((0, 1)), [204, 76.5, 0], atol=5)
 
 

@@ -17,7 +17,7 @@ _FLEXION = (-0.35, 1.75)
 _ABDUCTION, _TWIST = 0.5, 0.4
 _SAMPLES = 150
 _RIDGE = 3e-1
-_ON_JOINT_M, _MARGIN_M, _MOST_M = 0.0005, 0.0010, 0.010
+_ON_JOINT_M, _MARGIN_M, _MAX_M = 0.0005, 0.0010, 0.010
 _BOOSTS = 8
 
 
@@ -84,7 +84,7 @@ class _Bend:
         """Push vertices back to their own side of the plane that halves the bend: there flesh meets flesh."""
         height = self.side * (posed * self.normal[:, None]).sum(-1)
         lack = np.where(self.side == 0, 0.0, np.maximum(_MARGIN_M - height, 0.0))
-        lack = self.claim * np.minimum(lack, _MOST_M)
+        lack = self.claim * np.minimum(lack, _MAX_M)
         return posed + (self.side * lack)[..., None] * self.normal[:, None]
 
     def _at_rest(self, posed: np.ndarray) -> np.ndarray:

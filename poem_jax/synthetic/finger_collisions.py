@@ -49,7 +49,7 @@ def posed_fingers(pose: Float[Array, "n 16 3"]) -> Float[np.ndarray, "n 5 4 3"]:
     return np.concatenate([joints[:, 1:].reshape(-1, 5, 3, 3), tips[:, :, None]], axis=2)
 
 
-def clearance(fingers: Float[np.ndarray, "n 5 4 3"]) -> Float[np.ndarray, " n"]:
+def smallest_gap(fingers: Float[np.ndarray, "n 5 4 3"]) -> Float[np.ndarray, " n"]:
     """Return the smallest gap between capsules that should not touch, metres; negative = they overlap."""
     first, second, allowed = _pairs()
     starts, ends = _segments(fingers)
