@@ -47,6 +47,7 @@ def detect_hands(
     rig: Rig,
     *,
     detector: Callable[[UInt8[Array, "h w 3"]], Sequence[Detection]] | None = None,
+    when_stopped: Callable[[HandBoxes], object] | None = None,
     progress: bool = True,
 ) -> HandBoxes:
     """Find one right and one left hand in every image of a capture.
@@ -55,6 +56,8 @@ def detect_hands(
         frames: From `find_frames`; images that are missing or damaged see nothing (a warning names them).
         rig: The cameras.
         detector: Finds the hands of an RGB image; None = MediaPipe.
+        when_stopped: Called with the hands of the frames that are done, where there are any, when a signal
+            stops the search; the `KeyboardInterrupt` then passes on.
         progress: Show a progress bar when there are several frames.
 
     Returns: key points (frame, 2, view, 21, 2) in the raw images, right hand first; NaN = not found.
@@ -65,22 +68,42 @@ def detect_hands(
     """
     detector = _mediapipe_detector() if detector is None else detector
     keypoints = np.full((len(frames), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
-    for frame, paths in enumerate(tqdm(frames, unit="frame", disable=not progress or len(frames) == 1)):
-        for view, path in enumerate(paths.images):
-            if path is None:
-                continue
-            try:
-                image = read_image(path, (int(rig.size_wh[view][0]), int(rig.size_wh[view][1])))
-            except (FileNotFoundError, ValueError) as error:
-                _log.warning("frame %s: an image is left out: %s", paths.name, error)
-                continue
-            for side, found in one_of_each_side(detector(image)).items():
-                keypoints[frame, SIDES.index(side), view] = found.keypoints_px
+    names = tuple(frame.name for frame in frames)
+    done = 0
+    try:
+        for paths in tqdm(frames, unit="frame", disable=not progress or len(frames) == 1):
+            keypoints[done] = _hands_of_frame(paths, rig, detector)
+            done += 1
+    except KeyboardInterrupt:
+        if when_stopped is not None and np.isfinite(keypoints[:done]).any():
+            when_stopped(_hand_boxes(keypoints[:done], names[:done]))
+        raise
     if np.isnan(keypoints).all():
         raise ValueError(
             f"no hand was found in any image of {len(frames)} frames; give boxes or key points instead"
         )
-    return HandBoxes(boxes_from_keypoints(keypoints), SIDES, tuple(f.name for f in frames), keypoints)
+    return _hand_boxes(keypoints, names)
+
+
+def _hand_boxes(keypoints: Float[Array, "frame 2 view 21 2"], names: tuple[str, ...]) -> HandBoxes:
+    return HandBoxes(boxes_from_keypoints(keypoints), SIDES, names, keypoints)
+
+
+def _hands_of_frame(
+    paths: FramePaths, rig: Rig, detector: Callable[[UInt8[Array, "h w 3"]], Sequence[Detection]]
+) -> Float[Array, "2 view 21 2"]:
+    keypoints = np.full((len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
+    for view, path in enumerate(paths.images):
+        if path is None:
+            continue
+        try:
+            image = read_image(path, (int(rig.size_wh[view][0]), int(rig.size_wh[view][1])))
+        except (FileNotFoundError, ValueError) as error:
+            _log.warning("frame %s: an image is left out: %s", paths.name, error)
+            continue
+        for side, found in one_of_each_side(detector(image)).items():
+            keypoints[SIDES.index(side), view] = found.keypoints_px
+    return keypoints
 
 
 def one_of_each_side(detections: Sequence[Detection]) -> dict[str, Detection]:

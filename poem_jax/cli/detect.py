@@ -1,6 +1,7 @@
 """`poem detect`."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from poem_jax.cli.messages import say, tells_what_is_left
 from poem_jax.cli.options import File, Flag, OptionalFile, PositionalFolder
@@ -34,7 +35,7 @@ class Detect:
         frames = find_frames(self.folder, rig.names)
         say(f"looking for hands in {len(frames)} frames of {rig.num_views} cameras")
         with tells_what_is_left(self.out):
-            hands = detect_hands(frames, rig)
+            hands = detect_hands(frames, rig, when_stopped=partial(write_boxes, self.out))
             write_boxes(self.out, hands)
         views = np.isfinite(hands.boxes_px).all(-1).sum(2)
         for side, count in zip(hands.hand_side, views.T, strict=True):

@@ -44,6 +44,22 @@ def test_hands_go_to_their_side_frame_and_view(capture, caplog):
     assert "1b.png" in caplog.text
 
 
+def test_a_search_that_is_stopped_keeps_the_frames_that_are_done(capture):
+    frames, rig = capture
+    kept = []
+
+    def stopped_at_the_second(image):
+        if image[0, 0, 0] == 20:
+            raise KeyboardInterrupt
+        return [found("left", 0.9)]
+
+    with pytest.raises(KeyboardInterrupt):
+        detect_hands(frames, rig, detector=stopped_at_the_second, when_stopped=kept.append, progress=False)
+    (hands,) = kept
+    assert hands.frames == ("0",)
+    np.testing.assert_array_equal(hands.keypoints_px[0, 1, 0], found("left", 0.9).keypoints_px)
+
+
 def scores(*detections: Detection) -> dict[str, float]:
     return {side: hand.score for side, hand in one_of_each_side(detections).items()}
 
