@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
@@ -12,6 +13,8 @@ from poem_jax.io.stopping import Stopped
 
 STOPPED = 128
 """What the number of the signal that ended a program is added to, for its exit code."""
+
+_SOON_S = 0.05
 
 
 @contextlib.contextmanager
@@ -25,11 +28,21 @@ def stop_on_signals() -> Iterator[None]:
         raise Stopped(signal.Signals(number))
 
     previous = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
+    sys.unraisablehook, report = _again_when_lost, sys.unraisablehook
     try:
         yield
     finally:
+        sys.unraisablehook = report
         for kind, handler in previous.items():
             signal.signal(kind, handler)
+
+
+def _again_when_lost(lost: Any) -> None:
+    """Send a signal once more that came in a callback of the garbage collector, where exceptions are lost."""
+    if isinstance(lost.exc_value, Stopped):
+        threading.Timer(_SOON_S, os.kill, (os.getpid(), lost.exc_value.signal)).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def exit_code(request: KeyboardInterrupt) -> int:

@@ -1,5 +1,6 @@
 """How commands end: by a signal, and when nobody reads what they print."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -12,6 +13,8 @@ import pytest
 from poem_jax.cli import main, run
 from poem_jax.cli.demo import Demo
 from poem_jax.cli.messages import tells_what_is_left
+from poem_jax.cli.signals import stop_on_signals
+from poem_jax.io.stopping import Stopped
 
 POEM = (sys.executable, "-m", "poem_jax.cli")
 
@@ -45,6 +48,24 @@ def test_a_signal_ends_a_command_in_words(tmp_path, monkeypatch, capsys, kind, c
     assert f"poem: stopped by {kind.name}" in error
     assert "Traceback" not in error
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+
+def test_a_signal_that_comes_while_garbage_is_collected_is_not_lost():
+    """JAX has such a callback; what is raised in one goes no further."""
+
+    def callback(phase, info):
+        gc.callbacks.remove(callback)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def work():
+        with stop_on_signals():
+            gc.callbacks.append(callback)
+            gc.collect()
+            time.sleep(10)
+            raise AssertionError("the command went on")
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        work()
 
 
 def test_the_files_of_an_earlier_run_are_not_what_was_done(tmp_path, capsys):
