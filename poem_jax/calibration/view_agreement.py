@@ -22,6 +22,8 @@ from poem_jax.typing import Array, Bool, Float
 SUSPICIOUS_SHARE = 0.006
 """Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
 between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
+CAUSES = ("copied images", "flipped image", "cameras exchanged")
+"""Names of the findings that say why views disagree, not only that they do."""
 MAX_ORDERED_VIEWS = 5
 """Of so many cameras every order is tried; of more, every exchange of two."""
 _MAX_POINTS = 2000

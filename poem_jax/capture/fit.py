@@ -84,7 +84,7 @@ def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
         if not checked:
-            check_triangulation(take.rig, keypoints)
+            check_triangulation(take.rig, raw)
         warnings = [] if said else [str(finding) for finding in judge_views(take.rig, raw)]
         checked, said = True, said or bool(warnings)
         fitted = []

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from poem_jax.calibration.epipolar import ideal_keypoints
+from poem_jax.calibration.hypotheses import MIN_AGREEING, HandSize, explain
 from poem_jax.capture.frame_padding import padded_frames
-from poem_jax.geometry.camera_checks import INVERTED
 from poem_jax.geometry.rig import Rig
-from poem_jax.geometry.transforms import invert_rigid
 from poem_jax.geometry.world_origin import distant_origin, move_origin
-from poem_jax.hand.topology import ROOT_JOINT, WRIST
+from poem_jax.hand.joint_orders import JOINT_ORDERS
+from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.topology import BONES, NUM_SHAPES, NUM_SKELETON_JOINTS, ROOT_JOINT, WRIST
 from poem_jax.typing import Array, Float
 
 if TYPE_CHECKING:
@@ -29,35 +31,53 @@ _LEAST_GAIN = 5.0
 _MOST_FRAMES = 0.75
 """The mirror image must be likelier by e^5 in the median frame, and likelier at all in three of four."""
 _FITS_NOT = 4.0
-_AGREEING = (0.75, 0.9)
-"""Shares of the key points on which views agree: below the first, extrinsics are wrong; above the second
-their inverses are right."""
 
 
 def check_triangulation(rig: Rig, keypoints_px: Float[Array, "frame hand view 21 2"]) -> None:
     """Raise if the key points cannot be triangulated, or give hands of an impossible size.
 
+    Args:
+        rig: The cameras.
+        keypoints_px: In pixels of the raw images; NaN = unseen.
+
     Raises:
-        ValueError: The extrinsics map camera to world; their unit is not what the rig says. The message
-            says what one unit seems to be.
+        ValueError: A mistake explains it, which the message names with its fix (`calibration.hypotheses`), or
+            the hands are of an impossible size for a reason unknown.
     """
-    points = _triangulated(rig, keypoints_px)
-    if _agreeing_share(points, keypoints_px) < _AGREEING[0]:
-        inverse = rig._replace(T_cam_from_world=invert_rigid(rig.T_cam_from_world))
-        if _agreeing_share(_triangulated(inverse, keypoints_px), keypoints_px) > _AGREEING[1]:
-            raise ValueError(INVERTED)
-    both = points.valid[..., WRIST] & points.valid[..., ROOT_JOINT]
-    if not both.any():
+    ideal = ideal_keypoints(rig, keypoints_px)
+    points = _triangulated(rig, ideal)
+    palm_m = _palm_length(points)
+    if _agreeing_share(points, ideal) >= MIN_AGREEING and PALM_M[0] <= palm_m <= PALM_M[1]:
         return
-    palm = np.linalg.norm(points.points[..., WRIST, :] - points.points[..., ROOT_JOINT, :], axis=-1)
-    length = float(np.median(palm[both]))
-    if not PALM_M[0] <= length <= PALM_M[1]:
+    findings = explain(rig, keypoints_px, adult_hand_size(), JOINT_ORDERS)
+    if PALM_M[0] <= palm_m <= PALM_M[1]:
+        # Without a known cause some views may serve: those that do not are named as a warning.
+        findings = [finding for finding in findings if finding.name not in ("views disagree", "no hand")]
+    if findings:
+        raise ValueError("; and ".join(map(str, findings)))
+    if not PALM_M[0] <= palm_m <= PALM_M[1]:
         raise ValueError(
-            f"the rig's lengths are not metres: the hands' palms (wrist to middle knuckle) come out as "
-            f"{length:.3g} m, expected {PALM_M[0]} to {PALM_M[1]}. If the hands are adult, one unit of the "
-            f"rig is about {1000 * ADULT_PALM_M / length:.2g} mm of what it says it is: correct `unit`, or "
-            "scale every `t`"
+            f"the hands' palms (wrist to middle knuckle) come out as {palm_m:.3g} m, expected {PALM_M[0]} to "
+            f"{PALM_M[1]}, and no known mistake explains it; check rig and key points"
         )
+
+
+@functools.cache
+def adult_hand_size() -> HandSize:
+    """Return the bones of the shipped hand, between key points in OpenPose's order."""
+    from poem_jax.hand.template import default_hand
+
+    hand = default_hand()
+    joints = hand_mesh(hand, np.zeros((NUM_SKELETON_JOINTS, 3)), np.zeros(NUM_SHAPES)).joints
+    a, b = np.asarray(joints, np.float64)[np.array(BONES).T]
+    return HandSize(BONES, np.linalg.norm(a - b, axis=-1))
+
+
+def _palm_length(points: "RobustPoints") -> float:
+    """Return the median distance from wrist to middle knuckle, metres; an adult's where none is seen."""
+    both = points.valid[..., WRIST] & points.valid[..., ROOT_JOINT]
+    palm = np.linalg.norm(points.points[..., WRIST, :] - points.points[..., ROOT_JOINT, :], axis=-1)
+    return float(np.median(palm[both])) if both.any() else ADULT_PALM_M
 
 
 def judge_fit(name: str, own: "FitResult", other: "FitResult", noise: "KeypointNoise") -> list[str]:
