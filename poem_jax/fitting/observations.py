@@ -14,9 +14,9 @@ class Observations(NamedTuple):
 
     uv_px: Float[Array, "*batch view joint 2"]
     """Pixels of the undistorted images, OpenPose order; NaN = unseen."""
-    weights: Float[Array, "*batch view joint"] | None
+    weights: Float[Array, "*batch view joint"]
     """Inverse variance of a pixel coordinate, on any scale: zero, negative or NaN = unseen, whatever the
-    pixels; None = all alike."""
+    pixels are. None, where observations are given, stands for ones."""
     K: Float[Array, "*#batch view 3 3"]
     T_cam_from_world: Float[Array, "*#batch view 4 4"]
     """Metres. A camera with numbers that are not finite is unknown: its key points count as unseen."""
