@@ -26,7 +26,7 @@ from poem_jax.io.file_names import safe_file_name, safe_file_names
 from poem_jax.io.meshes import is_own_mesh, write_mesh
 from poem_jax.typing import Array, Float, Int, UInt8
 from poem_jax.viz.overlay import MeshInView, draw_overlay
-from poem_jax.viz.page import HAND_RGB, HOW_TO_GET_THE_PAGE, page_available, write_page
+from poem_jax.viz.page import HAND_RGB, write_page
 
 MESH_SUFFIXES = (".glb", ".obj")
 PREDICTION, REPORT, PAGE, ANIMATION = "prediction.npz", "report.json", "index.html", "hands.glb"
@@ -186,9 +186,6 @@ class _Writer:
 
     def _write_page(self) -> None:
         """Write the page if that can be done here; a warning says why not. The rest does not need it."""
-        if not page_available():
-            _log.warning(HOW_TO_GET_THE_PAGE)
-            return
         try:
             page = write_page(self._out / PAGE, self._pages.kept, self._gallery.cameras, self._style.faces)
             self.files.append(page)

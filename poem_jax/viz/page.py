@@ -1,8 +1,8 @@
 """One self-contained HTML page per reconstruction: meshes, cameras with their images, and a frame slider.
 
 The page is viser's client with the recorded scene in it: it opens from disk with no network. A take becomes
-a recording in which every frame lasts `SECONDS_PER_FRAME`; viser's playback bar is the slider. viser is an
-extra, imported only here.
+a recording in which every frame lasts `SECONDS_PER_FRAME`; viser's playback bar is the slider. viser is
+imported only here, and late, since it takes a while.
 """
 
 import contextlib
@@ -21,7 +21,6 @@ from poem_jax.typing import Array, Float, Int, UInt8
 
 SECONDS_PER_FRAME = 0.5
 HAND_RGB = {"right": (255, 120, 40), "left": (50, 130, 255)}
-HOW_TO_GET_THE_PAGE = "the 3D page needs viser: pip install 'poem-jax[viz]'; everything else is written"
 
 _FIELD_OF_VIEW = np.deg2rad(55.0)
 _FRUSTUM_DEPTH_SHARE = 0.3
@@ -60,13 +59,6 @@ class View(NamedTuple):
     up: Float[Array, "3"]
     fov: float
     """Vertical field of view, radians."""
-
-
-def page_available() -> bool:
-    """Tell whether viser is installed."""
-    import importlib.util
-
-    return importlib.util.find_spec("viser") is not None
 
 
 def initial_view(points_world: Float[Array, "point 3"], T_cam_from_world: Float[Array, "view 4 4"]) -> View:
@@ -142,12 +134,9 @@ def write_page(
 
     Raises:
         ValueError: No frame, or no hand in any frame and no `view`.
-        ModuleNotFoundError: viser is not installed; the message says how to get it.
     """
     if not frames:
         raise ValueError("a page needs at least one frame; got none")
-    if not page_available():
-        raise ModuleNotFoundError(HOW_TO_GET_THE_PAGE)
     if view is None:
         view = initial_view(_first_points(frames), np.stack([camera.T_cam_from_world for camera in cameras]))
     with _silent_server() as server:

@@ -57,11 +57,3 @@ def test_results_need_a_folder(make_capture, tmp_path, run):
         with pytest.raises(ValueError, match=r"results go to a folder, and .*file is a file; give another"):
             run(capture, out)
     assert (tmp_path / "file").read_text() == "keep"
-
-
-def test_without_viser_everything_else_is_written(make_capture, tmp_path, run, monkeypatch, caplog):
-    monkeypatch.setattr(write, "page_available", lambda: False)
-    written = run(make_capture(), tmp_path / "out")
-    assert "index.html" not in {path.name for path in written.files}
-    assert "pip install 'poem-jax[viz]'" in caplog.text
-    assert (tmp_path / "out" / "report.json").exists()

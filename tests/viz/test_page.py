@@ -18,7 +18,6 @@ from poem_jax.viz.page import (
     PageCamera,
     PageFrame,
     initial_view,
-    page_available,
     view_camera,
     write_page,
 )
@@ -85,8 +84,6 @@ def test_opposite_cameras_have_an_up_too():
 
 
 def test_one_self_contained_file(tmp_path):
-    if not page_available():
-        pytest.skip("viser is not installed")
     single = write_page(tmp_path / "one" / "index.html", frames(1), cameras(), FACES)
     take = write_page(tmp_path / "take.html", frames(4), cameras(), FACES)
     html = single.read_text()
@@ -100,8 +97,6 @@ def test_one_self_contained_file(tmp_path):
 
 
 def test_hands_may_come_and_go(tmp_path):
-    if not page_available():
-        pytest.skip("viser is not installed")
     nobody, right = PageFrame("a", {}, [None] * 4), frames(1)[0]
     both = right._replace(hands={"right": hand(), "left_0": hand("left", 1)})
     assert write_page(tmp_path / "p.html", [nobody, right, both, nobody], cameras(), FACES).exists()
@@ -113,8 +108,6 @@ def test_hands_may_come_and_go(tmp_path):
 
 
 def test_a_camera_without_a_picture_does_not_keep_that_of_the_frame_before(tmp_path, monkeypatch):
-    if not page_available():
-        pytest.skip("viser is not installed")
     shown = []
     show_images = page_module._show_images
 
@@ -129,12 +122,6 @@ def test_a_camera_without_a_picture_does_not_keep_that_of_the_frame_before(tmp_p
     assert not shown[0][0].any()
     np.testing.assert_array_equal(shown[0][1], second.images[1])
     np.testing.assert_array_equal(shown[1][0], third.images[0])
-
-
-def test_without_viser_the_message_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("poem_jax.viz.page.page_available", lambda: False)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'poem-jax\[viz\]'"):
-        write_page(tmp_path / "p.html", frames(1), cameras(), FACES)
 
 
 def screenshot(page, tmp_path):
