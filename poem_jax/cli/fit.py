@@ -47,7 +47,7 @@ class Fit:
         check_folder_is_writable(self.out)
         take = read_keypoint_take(self.keypoints, self.rig, self.images)
         hand = hand_from(self.mano)
-        say(f"{len(take.frames)} frames; the first run on a machine compiles the fit, once")
+        say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):
             meshes = self.meshes or None
             written = fit(take, self.out, hand=hand, smooth=self.smooth, meshes=meshes)

@@ -58,7 +58,7 @@ class Reconstruct:
         from poem_jax.capture.take import read_take
 
         take = read_take(self.folder, self.rig, self.boxes)
-        say(f"{len(take.frames)} frames; the first run on a machine compiles the model, once")
+        say(f"{take.num_frames} frames; the first run on a machine compiles the model, once")
         return reconstruct(take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None)
 
     def _fit(self) -> "Written":
@@ -68,5 +68,5 @@ class Reconstruct:
 
         take = read_take(self.folder, self.rig, self.boxes)
         hand = hand_from(self.mano)
-        say(f"{len(take.frames)} frames; the first run on a machine compiles the fit, once")
+        say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         return fit(take, self.out, hand=hand, smooth=self.smooth, meshes=self.meshes or None)

@@ -82,7 +82,7 @@ def parse(arguments: Sequence[str]) -> Command:
     return replace(command, overrides=(*fields, *asked_for_help))
 
 
-def _cli(arguments: Sequence[str], **options: bool) -> Any:
+def _cli(arguments: Sequence[str], **options: Any) -> Any:
     return tyro.cli(
         _Commands,  # pyright: ignore[reportArgumentType]
         prog="poem",
