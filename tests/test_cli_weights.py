@@ -315,17 +315,17 @@ FAILURES: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
     "LFS pointer": (
         lambda folder: (folder / "assets/bps.npy").write_text("version https://git-lfs.github.com/spec/v1"),
         [],
-        r"bps\.npy must be an \.npy file of numbers; .*magic string .*Fetch it again",
+        r"bps\.npy must be an npy of plain numbers; .*magic string .*Fetch it again",
     ),
     "cut assets": (
         lambda folder: _cut(folder / "assets/anchor.npy"),
         [],
-        r"anchor\.npy must be an \.npy file",
+        r"anchor\.npy must be an npy of plain numbers; .*Is it cut short",
     ),
     "objects": (
         lambda folder: np.save(folder / "assets/anchor_idx.npy", np.array([None]), allow_pickle=True),
         [],
-        r"anchor_idx\.npy must be an \.npy file of numbers; .*Object arrays",
+        r"anchor_idx\.npy must be an npy of plain numbers; .*Python objects",
     ),
     "shape": (
         lambda folder: np.save(folder / "assets/bps.npy", np.zeros((2, 64, 3))),

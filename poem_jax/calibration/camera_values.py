@@ -107,8 +107,10 @@ def rotation(value: Any, where: str) -> Float[Array, "3 3"]:
     if hint is not None:
         raise ValueError(f"{where}: `R` must have shape (3, 3); got {_shape(value)}{hint}")
     R = numbers(value, (3, 3), f"{where}: `R`")
-    deviation, det = float(rotation_error(R)), float(np.linalg.det(R))
-    if deviation > ROTATION_TOLERANCE or det < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation, det = float(rotation_error(R)), float(np.linalg.det(R))
+    # Written so that NaN, of numbers that overflow, fails too.
+    if not (deviation <= ROTATION_TOLERANCE and det > 0):
         fix = ""
         if deviation <= ROTATION_TOLERANCE:
             fix = "; it is a reflection, as left-handed axes give: negate one axis"

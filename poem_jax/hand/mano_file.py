@@ -176,8 +176,8 @@ def _agreement_of_length_and_width(v_template: np.ndarray, shapedirs: np.ndarray
     the result is the correlation (about zero) of the two slopes over the ten directions.
     """
     place = (v_template - v_template.mean(axis=0)).astype(np.float64)
-    growth = np.einsum("vc,vck->ck", place, shapedirs) / np.square(place).sum(axis=0)[:, None]
-    length, width = growth[0], growth[2]
+    # Not divided by the spread of the places, which the correlation does not know either.
+    length, _, width = np.einsum("vc,vck->ck", place, shapedirs)
     size = np.linalg.norm(length) * np.linalg.norm(width)
     return float(length @ width / size) if size > 0 else 0.0
 

@@ -52,7 +52,8 @@ def check_checksums(file: Path, folder: Path) -> None:
 
 def _read(file: Path) -> dict[str, tuple[int, str]]:
     try:
-        return {name: (entry["bytes"], entry["sha256"]) for name, entry in read_json(file).items()}
+        entries = read_json(file).items()
+        return {name: (int(entry["bytes"]), str(entry["sha256"])) for name, entry in entries}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
             f"{file} is not a list of files and digests ({type(error).__name__}: {error}). "

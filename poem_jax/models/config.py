@@ -18,15 +18,24 @@ def require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
-def _require_counts(owner: Any, *names: str) -> None:
-    """Insist that fields are whole numbers from 1, or tuples of them."""
+MAX_COUNT = 2**16
+"""Of points, channels or pixels along a side; the largest model has 4096. A config.json may come from
+anywhere, and what it asks for is built before its weights are read."""
+MAX_LAYERS = 256
+"""Of layers, blocks or modules in a row; the largest model has 9."""
+
+
+def _require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
+    """Insist that fields are whole numbers from 1 to `most`, or tuples of at most `MAX_LAYERS` of them."""
     for name in names:
         value = getattr(owner, name)
         entries = value if isinstance(value, tuple) else (value,)
+        require(len(entries) <= MAX_LAYERS, f"`{name}` must name at most {MAX_LAYERS}; got {len(entries)}")
         require(
             all(type(entry) is int and entry >= 1 for entry in entries),
             f"`{name}` must be whole and at least 1; got {value}",
         )
+        require(max(entries, default=0) <= most, f"`{name}` must be at most {most}; got {value}")
 
 
 class Stem(enum.StrEnum):
@@ -52,7 +61,8 @@ class HRNetConfig:
     """Residual blocks in every branch of a module."""
 
     def __post_init__(self) -> None:
-        _require_counts(self, "width", "stem_channels", "stem_blocks", "modules", "blocks")
+        _require_counts(self, "width", "stem_channels")
+        _require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
         require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 
     @property
@@ -82,7 +92,8 @@ class ResNetConfig:
             len(self.blocks) == len(self.channels) >= 1,
             f"`blocks` and `channels` must name the same stages; got {self.blocks} and {self.channels}",
         )
-        _require_counts(self, "blocks", "channels", "stem_channels")
+        _require_counts(self, "channels", "stem_channels")
+        _require_counts(self, "blocks", most=MAX_LAYERS)
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -351,9 +362,8 @@ class DecoderConfig:
     """From (query, channel) to (channel, query), before the parametric output pools the queries."""
 
     def __post_init__(self) -> None:
-        _require_counts(
-            self, "num_layers", "num_heads", "num_neighbours", "ffn_expansion", "cross_attention_basis_stride"
-        )
+        _require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
+        _require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
         require(0 <= self.dropout < 1, f"`dropout` must be in [0, 1); got {self.dropout}")
         require(
             self.vector_form is VectorForm.BASIS or self.num_neighbours <= NUM_QUERIES,

@@ -10,6 +10,7 @@ import types
 import typing
 from typing import Any, TypeVar
 
+from poem_jax.io.json_file import parse_json
 from poem_jax.models.config import Config, require
 
 _T = TypeVar("_T")
@@ -30,7 +31,12 @@ def from_json(text: str) -> Config:
         ValueError: unknown key, missing or unknown `kind`, a value of the wrong type, or one that breaks a
             rule of its dataclass.
     """
-    return _decode(_at_their_new_place(json.loads(text)), Config, "config")
+    return from_values(parse_json(text, "the config"))
+
+
+def from_values(values: Any) -> Config:
+    """Read a config from the values of its JSON form; errors as in `from_json`."""
+    return _decode(_at_their_new_place(values), Config, "config")
 
 
 def _at_their_new_place(values: Any) -> Any:
@@ -60,19 +66,19 @@ def _decode(value: Any, declared: Any, path: str) -> Any:
         return _decode_tuple(value, typing.get_args(declared), path)
     if issubclass(declared, enum.Enum):
         known = [member.value for member in declared]
-        require(value in known, f"`{path}` must be one of {known}; got {value!r}")
+        require(value in known, f"`{path}` must be one of {known}; got {_short(value)}")
         return declared(value)
     # A bool is an int to Python; a whole number is a good float.
     accepted = (int, float) if declared is float else (declared,)
-    require(type(value) in accepted, f"`{path}` must be of type {declared.__name__}; got {value!r}")
+    require(type(value) in accepted, f"`{path}` must be of type {declared.__name__}; got {_short(value)}")
     return declared(value)
 
 
 def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any, ...]:
-    require(isinstance(value, list), f"`{path}` must be a list; got {value!r}")
+    require(isinstance(value, list), f"`{path}` must be a list; got {_short(value)}")
     if entries[-1] is Ellipsis:
         entries = entries[:1] * len(value)
-    require(len(value) == len(entries), f"`{path}` must have {len(entries)} entries; got {value!r}")
+    require(len(value) == len(entries), f"`{path}` must have {len(entries)} entries; got {_short(value)}")
     return tuple(
         _decode(v, declared, f"{path}.{i}")
         for i, (v, declared) in enumerate(zip(value, entries, strict=True))
@@ -80,22 +86,27 @@ def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any,
 
 
 def _decode_union(value: Any, declared: Any, path: str) -> Any:
-    require(isinstance(value, dict), f"`{path}` must be an object; got {value!r}")
+    require(isinstance(value, dict), f"`{path}` must be an object; got {_short(value)}")
     options = {option.__name__: option for option in typing.get_args(declared)}
     kind = value.get(_KIND)
-    if kind not in options:
-        raise ValueError(f"`{path}.{_KIND}` must be one of {sorted(options)}; got {kind!r}")
+    if not isinstance(kind, str) or kind not in options:
+        raise ValueError(f"`{path}.{_KIND}` must be one of {sorted(options)}; got {_short(kind)}")
     return _decode_dataclass({k: v for k, v in value.items() if k != _KIND}, options[kind], path)
 
 
 def _decode_dataclass(value: Any, declared: type[_T], path: str) -> _T:
-    require(isinstance(value, dict), f"`{path}` must be an object; got {value!r}")
+    require(isinstance(value, dict), f"`{path}` must be an object; got {_short(value)}")
     hints = typing.get_type_hints(declared)
     unknown = sorted(set(value) - set(hints))
     if unknown:
-        raise ValueError(f"`{path}` has unknown keys {unknown}; known are {sorted(hints)}")
+        raise ValueError(f"`{path}` has unknown keys {_short(unknown)}; known are {sorted(hints)}")
     return declared(**{key: _decode(entry, hints[key], f"{path}.{key}") for key, entry in value.items()})
 
 
 def _is_union(declared: Any) -> bool:
     return isinstance(declared, types.UnionType)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 100 else text[:97] + "..."

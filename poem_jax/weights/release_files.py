@@ -12,6 +12,7 @@ import numpy as np
 
 from poem_jax.hand import mano_file
 from poem_jax.hand.model import HandModel
+from poem_jax.io.npz_file import read_npy
 from poem_jax.io.torch_file import load_state_dict, save_state_dict
 from poem_jax.models.config import Config
 from poem_jax.models.presets import preset
@@ -134,14 +135,9 @@ def _read(path: Path, shape: tuple[int, ...], kind: type[np.number]) -> np.ndarr
             f"{BASIS_FILE}, {ANCHOR_FILE} and {INDEX_FILE}"
         )
     try:
-        with path.open("rb") as stream:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-    # Damaged files raise what NumPy's header parser and the memory happen to raise.
-    except Exception as error:
-        raise ValueError(
-            f"{path} must be an .npy file of numbers; reading it stopped with {type(error).__name__}: "
-            f"{' '.join(str(error).split())}. Is it cut short or a Git LFS pointer? Fetch it again"
-        ) from error
+        array = read_npy(path)
+    except ValueError as error:
+        raise ValueError(f"{error}. Is it cut short or a Git LFS pointer? Fetch it again") from error
     if array.shape not in (shape, (1, *shape)) or not np.issubdtype(array.dtype, kind):
         raise ValueError(
             f"{path} must hold {kind.__name__} numbers of shape {shape} or {(1, *shape)}; got {array.dtype} "

@@ -17,8 +17,9 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.checksums import check_checksums, write_checksums
+from poem_jax.io.json_file import read_json
 from poem_jax.models.config import Config
-from poem_jax.models.config_json import from_json, to_json
+from poem_jax.models.config_json import from_values, to_json
 from poem_jax.models.network import StaticArray, describe, leaves_with_names, with_static_indices
 from poem_jax.typing import Array, Params, PyTree
 
@@ -209,7 +210,7 @@ def _read_config(path: Path) -> Config:
                 "Expected a folder that poem_jax.save wrote, with config.json and ckpt/"
             )
     try:
-        return from_json(file.read_text(encoding="utf-8"))
+        return from_values(read_json(file, what="model config"))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
             f"{file} is not a model config: {error}. Expected the JSON that poem_jax.save wrote"

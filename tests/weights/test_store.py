@@ -189,6 +189,39 @@ def test_a_damaged_config_is_a_value_error(saved, text):
         store.load(saved)
 
 
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ('{"basis": {"num_points": 1000000000000}}', "`num_points` must be at most 65536; got 1000000000000"),
+        ('{"decoder": {"num_layers": 10000000}}', "`num_layers` must be at most 256"),
+        ('{"width": 16, "width": 32}', "the key `width` comes more than once"),
+        ('{"image_mean": NaN}', "`image_mean` must be finite"),
+        ("[" * 10**5, "nests too deeply"),
+        ('{"width": 1e999}', "`width` must be finite"),
+        ('{"width": ' + "9" * 400 + "}", "`width` is a whole number beyond 64 bits"),
+        ('{"features": 5, "feature_stride": 8}', "is not a model config"),
+    ],
+)
+def test_a_hostile_config_is_refused_before_anything_is_built(saved, text, cause):
+    (saved / "config.json").write_text(text)
+    with pytest.raises(ValueError, match=rf"config\.json is not a model config: .*{cause}|{cause}"):
+        store.load(saved)
+
+
+def test_a_config_with_a_byte_order_mark_is_read(saved):
+    text = (saved / "config.json").read_bytes()
+    (saved / "config.json").write_bytes(b"\xef\xbb\xbf" + text)
+    assert store.load(saved)[0] == MICRO
+
+
+def test_unsealed_weights_are_never_read_in_silence(saved, caplog):
+    store.load(saved)
+    assert caplog.messages == []
+    (saved / "seal.json").unlink()
+    store.load(saved)
+    assert "is read unchecked: seal.json is missing" in caplog.text
+
+
 def test_a_config_that_is_not_the_arrays_own_is_a_value_error(saved):
     (saved / "config.json").write_text(to_json(replace(MICRO, width=32)))
     with pytest.raises(ValueError, match=r"arrays do not fit the config: .*Use the config"):
