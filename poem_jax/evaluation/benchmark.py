@@ -137,10 +137,10 @@ def run_benchmark(
     total = num_batches * len(settings.views)
     with tqdm(total=total, unit="batch", desc="evaluating", disable=not settings.progress) as bar:
         for batch, draws in zip(_batches(captures, settings), noise, strict=True):
-            truths.append(_real(batch, _truth(batch)))
+            truths.append(_without_padding(batch, _truth(batch)))
             for n in settings.views:
                 part = nested_views(batch, n)
-                rows[n].append(_real(batch, _row(part, predict(part), draws[:, :n])))
+                rows[n].append(_without_padding(batch, _row(part, predict(part), draws[:, :n])))
                 bar.update()
     truth = _joined(truths)
     return {n: _scores(_joined(rows[n]), truth, settings.protocol, hand) for n in settings.views}
@@ -156,10 +156,10 @@ def nested_views(batch: MultiViewBatch, num_views: int) -> MultiViewBatch:
 
 def _batches(captures: Captures, settings: BenchmarkSettings) -> Iterator[MultiViewBatch]:
     """Yield the captures in order; the last batch is padded, so that one program serves all."""
-    most = max(settings.views)
+    max_views = max(settings.views)
     for start in range(0, settings.samples, settings.batch_size):
         indices = range(start, min(start + settings.batch_size, settings.samples))
-        batch = collate([captures.sample(index, num_views=most) for index in indices], most)
+        batch = collate([captures.sample(index, num_views=max_views) for index in indices], max_views)
         yield pad_batch(batch, settings.batch_size)
 
 
@@ -202,7 +202,7 @@ def _float64(array: Array) -> np.ndarray:
     return np.asarray(array, dtype=np.float64)
 
 
-def _real(batch: MultiViewBatch, leaves: _Leaves) -> _Leaves:
+def _without_padding(batch: MultiViewBatch, leaves: _Leaves) -> _Leaves:
     """Drop the samples that only pad the batch."""
     return type(leaves)(*(leaf[batch.sample_mask] for leaf in leaves))
 

@@ -1,0 +1,64 @@
+"""The weights that come with the package: as good as promised, and both stages alive."""
+
+import numpy as np
+import pytest
+
+from poem_jax.cli.evaluate import captures_config
+from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
+from poem_jax.evaluation.stages import FeatureErrors, errors_by_features, paired_difference
+from poem_jax.experiments import open_experiment
+from poem_jax.synthetic.dataset import SyntheticDataset
+from poem_jax.weights.store import shipped
+
+SEED, SAMPLES, VIEWS = 987654, 64, 4
+"""Of the captures, on which no model was trained or chosen."""
+MAX_MPVPE_MM = 15.9
+"""On these captures; 15.64 when it was set. Better weights lower it."""
+
+
+@pytest.fixture(scope="module")
+def captures() -> SyntheticDataset:
+    """The distribution on which the shipped model was trained, drawn anew."""
+    return SyntheticDataset(captures_config(open_experiment("tiny_synthetic")), seed=SEED)
+
+
+@pytest.fixture(scope="module")
+def errors(captures) -> FeatureErrors:
+    config, params = shipped()
+    return errors_by_features(params, config, captures, samples=SAMPLES, num_views=VIEWS)
+
+
+def test_it_is_there_and_of_its_experiment() -> None:
+    config, _ = shipped()
+    assert config == open_experiment("tiny_synthetic").model
+
+
+def test_it_has_not_got_worse(errors) -> None:
+    print(f"MPVPE {errors.own.mean():.3f} mm")
+    assert errors.own.mean() <= MAX_MPVPE_MM
+
+
+@pytest.mark.parametrize(("features", "margin_mm"), [("zero", 0.5), ("another", 0.1)])
+def test_its_second_stage_reads_the_images(errors, features: str, margin_mm: float) -> None:
+    """On the same captures it is worse without its features, and with those of another capture.
+
+    By 1.00 and 0.29 mm when this was written, 9 and 4.5 standard errors. A second stage that ignores its
+    features differs by nothing, one that ignores whose they are differs in the first case alone.
+    """
+    worse = paired_difference(getattr(errors, features), errors.own)
+    print(worse)
+    assert worse.mean_mm >= margin_mm
+    assert worse.mean_mm >= 3 * worse.standard_error_mm
+
+
+@pytest.mark.slow
+def test_more_views_are_better(captures) -> None:
+    """On 200 captures, as the README's table counts them."""
+    config, params = shipped()
+    settings = BenchmarkSettings(views=(2, 4, 8), samples=200, seed=SEED, progress=False)
+    scores = run_benchmark(model_predictor(params, config), captures, settings)
+    means = [scores[n]["mpvpe_mm"] for n in (2, 4, 8)]
+    print(means)
+    assert np.all(np.diff(means) < 0)
+    assert means[1] <= MAX_MPVPE_MM
+    assert means[1] <= scores[4]["mean_pose_mpvpe_mm"] / 3
