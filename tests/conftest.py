@@ -4,6 +4,7 @@ import importlib.util
 import os
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 # Eight host devices let the tests of data-parallel training run on a CPU; JAX reads this when it starts.
@@ -47,15 +48,8 @@ def micro_model():
     import jax
 
     from poem_jax.models.apply import init
-    from poem_jax.models.config import BasisConfig, Config, DecoderConfig, ResNetConfig, Stem
+    from tests.micro import MICRO
 
-    config = Config(
-        image_hw=(64, 64),
-        width=16,
-        backbone=ResNetConfig(
-            (1, 1, 1, 1), (8, 8, 8, 8), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
-        ),
-        basis=BasisConfig(num_points=64),
-        decoder=DecoderConfig(num_layers=1, num_neighbours=4, ffn_expansion=1),
-    )
-    return config, jax.jit(lambda key: init(config, key=key))(jax.random.key(0))
+    four_stages = replace(MICRO.backbone, blocks=(1, 1, 1, 1), channels=(8, 8, 8, 8))
+    config = replace(MICRO, image_hw=(64, 64), backbone=four_stages)
+    return config, init(config, key=jax.random.key(0))

@@ -10,23 +10,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = """
-from poem_jax.models.config import BasisConfig, Config, DecoderConfig, ResNetConfig, RootConfig, Stem
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.training.config import BatchShape, DataConfig, RunConfig, TrainConfig
+from tests.micro import MICRO
 
-trunk = ResNetConfig(
-    blocks=(1, 1), channels=(8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
-)
 config = TrainConfig(
     name="micro",
-    model=Config(
-        image_hw=(32, 32),
-        width=16,
-        backbone=trunk,
-        root=RootConfig(stride=4),
-        basis=BasisConfig(num_points=64),
-        decoder=DecoderConfig(num_layers=1, num_heads=2, num_neighbours=4, ffn_expansion=2),
-    ),
+    model=MICRO,
     data=DataConfig(
         synthetic=SyntheticConfig(image_hw=(32, 32), num_views=2, supersample=1, num_backgrounds=2),
         batches=(BatchShape(num_views=2, batch_size=2),),

@@ -13,31 +13,23 @@ from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import (
     AggregationConfig,
-    BasisConfig,
     Config,
-    DecoderConfig,
     DecoderOutput,
     FirstNeighbours,
     HRNetConfig,
     QueryStart,
-    ResNetConfig,
     RootConfig,
     Similarity,
-    Stem,
 )
 from poem_jax.models.hand_output import template_queries
 from poem_jax.models.network import describe
 from poem_jax.models.point_features import basis_points
+from tests import micro
 
-_MICRO = Config(
-    image_hw=(32, 32),
-    width=16,
-    backbone=ResNetConfig(
-        blocks=(1, 1), channels=(8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
-    ),
-    basis=BasisConfig(num_points=64),
+_MICRO = replace(
+    micro.MICRO,
     aggregation=AggregationConfig(similarity=Similarity.MEAN),
-    decoder=DecoderConfig(num_layers=2, num_neighbours=4, ffn_expansion=1),
+    decoder=replace(micro.MICRO.decoder, num_layers=2),
 )
 
 

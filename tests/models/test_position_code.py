@@ -18,7 +18,7 @@ def test_sine_code_is_the_written_formula():
 
 
 def _written(k: int, size: int, width: int) -> np.ndarray:
-    """FACTS section 4, number by number."""
+    """The code of the k-th of `size` cells, number by number: sines, then cosines."""
     angle = k / (size + 1e-6) * 2 * np.pi
     divisor = [10000 ** (2 * (j // 2) / width) for j in range(width)]
     sines = [np.sin(angle / divisor[j]) for j in range(0, width, 2)]

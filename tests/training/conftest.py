@@ -1,6 +1,7 @@
 """A model small enough to train in a test, and batches for it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -11,30 +12,18 @@ from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.hand import default_hand, hand_mesh
 from poem_jax.losses import SYNTHETIC
 from poem_jax.models.apply import init
-from poem_jax.models.config import (
-    BasisConfig,
-    Config,
-    DecoderConfig,
-    HeatActivation,
-    ResNetConfig,
-    RootConfig,
-    Stem,
-)
+from poem_jax.models.config import HeatActivation, RootConfig
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.training.config import BatchShape, DataConfig, OptimizerConfig, RunConfig, TrainConfig
 from poem_jax.training.state import TrainState, create_state
+from tests import micro
 
 VIEWS, BATCH, HW = 3, 8, (32, 32)
 
-MICRO = Config(
-    image_hw=HW,
-    width=16,
-    backbone=ResNetConfig(
-        blocks=(1, 1), channels=(8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
-    ),
+MICRO = replace(
+    micro.MICRO,
     root=RootConfig(stride=4, activation=HeatActivation.SOFTMAX),
-    basis=BasisConfig(num_points=64),
-    decoder=DecoderConfig(num_layers=1, num_heads=2, num_neighbours=4, ffn_expansion=2),
+    decoder=replace(micro.MICRO.decoder, num_heads=2, ffn_expansion=2),
 )
 
 

@@ -12,20 +12,9 @@ import pytest
 
 import poem_jax
 from poem_jax.models.apply import init
-from poem_jax.models.config import BasisConfig, Config, DecoderConfig, ResNetConfig, RootConfig, Stem
 from poem_jax.models.config_json import to_json
 from poem_jax.weights import store
-
-MICRO = Config(
-    image_hw=(32, 32),
-    width=16,
-    backbone=ResNetConfig(
-        blocks=(1, 1), channels=(8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8
-    ),
-    root=RootConfig(stride=4),
-    basis=BasisConfig(num_points=64),
-    decoder=DecoderConfig(num_layers=1, num_heads=2, num_neighbours=4, ffn_expansion=2),
-)
+from tests.micro import MICRO
 
 
 @pytest.fixture(scope="module")
