@@ -36,7 +36,7 @@ PRESETS: tuple[str, ...] = ("v2-base", "v2-medium-release")
 VIEWS: tuple[int, ...] = (8, 4, 1)
 MIXED: tuple[int, ...] = (8, 5, 3, 1)
 TINY = ("tiny", (4,))
-LEAST_ROUNDS = 7
+MIN_ROUNDS = 7
 PARTS = ("trunk", "2D branches", "sampling, aggregation", "decoder")
 FORMS = ("plain", "optimised")
 PRODUCT_SIZE = 2048
@@ -48,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rounds", type=int, default=LEAST_ROUNDS, help=f"at least {LEAST_ROUNDS} (default)")
+    parser.add_argument("--rounds", type=int, default=MIN_ROUNDS, help=f"at least {MIN_ROUNDS} (default)")
     parser.add_argument("--preset", action="append", help="repeatable; without it both families and tiny")
     parser.add_argument("--views", type=int, action="append", help="repeatable; without it 8, 4, 1 and mixed")
     parser.add_argument("--quick", action="store_true", help="one round, one view: does it run? no figures")
@@ -58,8 +58,8 @@ def main() -> None:
         job = json.loads(given.job)
         print(json.dumps(JOBS[job.pop("name")](**job)))
         return
-    if given.rounds < LEAST_ROUNDS:
-        parser.error(f"--rounds must be at least {LEAST_ROUNDS}; got {given.rounds}")
+    if given.rounds < MIN_ROUNDS:
+        parser.error(f"--rounds must be at least {MIN_ROUNDS}; got {given.rounds}")
     rounds = 1 if given.quick else given.rounds
     views = [1] if given.quick else given.views or list(VIEWS)
     mixed = list(MIXED) if not (given.quick or given.views) else []
@@ -240,7 +240,7 @@ def measure_gpu(preset: str, half: bool) -> dict:
         images = jax.device_put(images)
         call = lambda i=images, c=cams, r=root: infer(prepared, i, c, root_world=r)  # noqa: E731
         _seconds(call)
-        taken = statistics.median(_seconds(call) for _ in range(LEAST_ROUNDS))
+        taken = statistics.median(_seconds(call) for _ in range(MIN_ROUNDS))
         first_ms = 1000 * taken if batch == 1 else first_ms
         best = max(best, (batch / taken, batch))
     return {"ms": first_ms, "rate": best[0], "batch": best[1]}

@@ -1,4 +1,4 @@
-"""The released models with procedural weights (FACTS section 14), and the inputs of the golden cases."""
+"""The released models with weights drawn from their parameters' names, and the inputs of the golden cases."""
 
 import functools
 import hashlib

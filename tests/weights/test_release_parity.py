@@ -1,4 +1,4 @@
-"""The released models, on procedural weights, against what the authors' code stored (FACTS section 13).
+"""The released models, on procedural weights, against what the authors' code stored.
 
 The tables are what the tests run over, so that no stored array is listed without being compared;
 `test_golden_coverage.py` sees to it that none is missing from them.

@@ -1,4 +1,4 @@
-"""Intermediates of the released models, and their stored float64 runs (FACTS section 13), all in float64.
+"""Intermediates of the released models, and their stored float64 runs, all in float64.
 
 There is no rounding on our side then: what differs is the rounding of the stored float32 arrays, and the
 stored float64 runs are met at every point of every block, all neighbours found.

@@ -1,4 +1,4 @@
-"""Losses, outputs, gradients and batch-norm buffers of the release's training path (FACTS section 15).
+"""Losses, outputs, gradients and batch-norm buffers of the release's training path.
 
 All noise is off: the root is the true joint 9 and nothing is dropped. `eval_modules` normalises by the
 running statistics, `train_modules` by those of the batch.

@@ -23,7 +23,7 @@ SHARE, FARTHEST_M = 0.995, 5e-3
 TIE, TIE_UNDER_MESH = 1e-5, 3e-6
 """Squared distances (in units of 10 cm) that two runs may order differently; the gap is typically 1e-3. The
 second is for searches whose outcome cannot be seen one by one: there each tie is tried."""
-MOST_SWAPS = 12
+MAX_SWAPS = 12
 """Searches of a case that may have to end otherwise; there are 3,196 per sample."""
 SEARCHES = {1: slice(0, 2), 2: slice(2, 4)}
 """Every block from the second on searches among the basis points, then among the queries."""
@@ -101,7 +101,7 @@ def _resolve_under_mesh(rerun: Rerun, run: Run) -> Run:
 
 def assert_only_ties(run: Run) -> None:
     """Few searches were swapped, all of them between neighbours as good as equally near."""
-    assert run.swapped.sum() <= MOST_SWAPS
+    assert run.swapped.sum() <= MAX_SWAPS
     assert run.gaps[run.swapped].max(initial=0) < TIE
     assert np.median(run.gaps) > 20 * TIE
 
