@@ -2,14 +2,20 @@
 
 import logging
 from collections.abc import Iterable, Iterator
+from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from poem_jax.capture.frame import Frame, ImageProblem
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.images import read_image
-from poem_jax.typing import Array, UInt8
+from poem_jax.typing import Array, Float, UInt8
+
+_SMALL_PX = 64
+_ONE_COLOUR, _SAME = 4.0, 8.0
+"""Levels of 255 in an image in small; compressing it again changes few by more than 3."""
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +47,8 @@ def read_images(
                 images.append(None)
                 problems.append(ImageProblem(bool(sees_hand[view]), error))
                 _log.warning("frame %s: an image is left out: %s", frame.name, error)
-        yield frame._replace(images=tuple(images), problems=tuple(problems))
+        frame = frame._replace(images=tuple(images), problems=tuple(problems))
+        yield with_odd_images_told(frame, rig) if needed else frame
 
 
 def _read_view(
@@ -57,3 +64,33 @@ def _read_view(
         f"frame {frame}: camera '{camera}' has a box but no image; expected {camera}.jpg or .png "
         "(to leave the view out, give it NaN boxes)"
     )
+
+
+def with_odd_images_told(frame: Frame, rig: Rig) -> Frame:
+    """Leave out images that show nothing, and warn of those that are the same.
+
+    One colour is that of a covered lens or a lost connection, and two cameras never take the same picture.
+    """
+    images, problems, warnings = list(frame.images), list(frame.problems), list(frame.warnings)
+    small = {view: _in_small(image) for view, image in enumerate(images) if image is not None}
+    for view in [view for view, picture in small.items() if np.ptp(picture) < _ONE_COLOUR]:
+        del small[view]
+        images[view] = None
+        said = f"the image of camera '{rig.names[view]}' shows nothing but one colour: it is left out"
+        problems.append(ImageProblem(False, ValueError(f"frame {frame.name}: {said}")))
+        warnings.append(said)
+    for a, b in combinations(small, 2):
+        if small[a].shape == small[b].shape and np.abs(small[a] - small[b]).max() < _SAME:
+            warnings.append(
+                f"cameras '{rig.names[a]}' and '{rig.names[b]}' have the same image: one is a copy; give "
+                "each camera its own. The hands are not to be trusted"
+            )
+    return frame._replace(images=tuple(images), problems=tuple(problems), warnings=tuple(warnings))
+
+
+def _in_small(image: UInt8[Array, "h w 3"]) -> Float[Array, "_ _"]:
+    """Return an image in grey, in which the traces of a compression are averaged away."""
+    longer = max(image.shape[:2])
+    width, height = (max(1, round(_SMALL_PX * side / longer)) for side in image.shape[1::-1])
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)

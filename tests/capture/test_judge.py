@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import Prediction
+from poem_jax.capture.frame import Frame, HandResult
+from poem_jax.capture.judge import SEVERAL, judge_hands
+from poem_jax.capture.lens import project_raw
 from poem_jax.capture.network import Network
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
@@ -102,3 +105,50 @@ def test_heat_maps_are_the_evidence_where_no_key_points_are_given(make_capture, 
     report = run(make_capture(), tmp_path / "out").report
     assert report["reprojection"]["against"] == "the model's own heat maps"
     assert report["reprojection"]["mean_px"] >= 0
+
+
+def seen_by(rig, joints, noise_px, rng):
+    """A hand whose key points a network sees in every view."""
+    views = [project_raw(rig, view, joints)[0] + rng.normal(0, noise_px, (21, 2)) for view in range(3)]
+    return HandResult(
+        np.ones(3, bool), joints_world=joints, vertices_world=joints, keypoints_px=np.stack(views)
+    )
+
+
+def warnings_of(rig, hands):
+    frames = [Frame(str(i), np.zeros((1, 3, 4)), hands=(hand,)) for i, hand in enumerate(hands)]
+    return [frame.warnings for frame in judge_hands(frames, rig)]
+
+
+def exchanged(hand, order):
+    return hand._replace(keypoints_px=hand.keypoints_px[order])
+
+
+@pytest.fixture
+def hands(rig):
+    rng, beside = np.random.default_rng(0), np.array([0.05, 0.03, -0.06])
+    return [seen_by(rig, beside + rng.uniform(-0.06, 0.06, (21, 3)), 3.0, rng) for _ in range(10)]
+
+
+def test_views_that_fit_are_not_complained_about(rig, hands):
+    assert warnings_of(rig, hands) == [()] * 10
+
+
+def test_exchanged_images_are_told_at_the_first_hand_and_once(rig, hands):
+    said = warnings_of(rig, [exchanged(hand, [1, 0, 2]) for hand in hands])
+    (warning,) = said[0]
+    assert "exchanged" in warning
+    assert "not to be trusted" in warning
+    assert said[1:] == [()] * 9
+
+
+def test_what_is_in_doubt_in_one_hand_is_told_by_several(rig, hands):
+    """A view that is off by a seventh of the hand's extent."""
+    extent = np.linalg.norm(np.ptp(hands[0].keypoints_px[1], axis=0))
+    off = [
+        hand._replace(keypoints_px=hand.keypoints_px + np.array([[[0, 0]], [[0.1, 0.2]], [[0, 0]]]) * extent)
+        for hand in hands
+    ]
+    said = warnings_of(rig, off)
+    assert said[0] == ()
+    assert [bool(warnings) for warnings in said].index(True) == SEVERAL - 1

@@ -1,0 +1,33 @@
+"""How much code one reconstruction is read in: a newcomer should find the way of an image in few files."""
+
+import sys
+from pathlib import Path
+
+import poem_jax
+from poem_jax.capture.demo import demo_folder
+from poem_jax.capture.pipeline import reconstruct
+from poem_jax.capture.take import read_take
+
+PACKAGE = Path(poem_jax.__file__).parent
+MAX_FILES = 25
+
+
+def test_reconstruct_enters_few_files_of_capture_and_models(micro_model, tmp_path):
+    from poem_jax.weights.store import save
+
+    save(tmp_path / "micro", *micro_model)
+    entered = set()
+
+    def note(frame, event, _):
+        if event == "call" and frame.f_code.co_name != "<module>":
+            entered.add(frame.f_code.co_filename)
+
+    sys.setprofile(note)
+    try:
+        reconstruct(read_take(demo_folder()), tmp_path / "out", checkpoint=tmp_path / "micro")
+    finally:
+        sys.setprofile(None)
+    ours = {Path(name).relative_to(PACKAGE) for name in entered if name.startswith(str(PACKAGE))}
+    counted = sorted(str(path) for path in ours if path.parts[0] in ("capture", "models"))
+    assert "capture/pipeline.py" in counted
+    assert len(counted) <= MAX_FILES, counted
