@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from poem_jax.capture.crop import hand_squares
-from poem_jax.capture.frame import Frame, HandResult, in_groups
+from poem_jax.capture.frame import Frame, HandResult
+from poem_jax.capture.take import in_groups
 from poem_jax.geometry.camera_checks import INVERTED, check_cameras, check_distances, views_meet
 from poem_jax.geometry.cameras import Cameras, crop_intrinsics
 from poem_jax.geometry.rig import Rig

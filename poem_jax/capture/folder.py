@@ -1,4 +1,6 @@
-"""The images of a capture: one per camera, or one folder per frame.
+"""The folder of a capture: its calibration, and its images, one per camera or one folder per frame.
+
+    DIR/rig.json or DIR/calibration/rig.json
 
     DIR/<camera>.jpg                    one frame
     DIR/frames/<frame>/<camera>.jpg     a take
@@ -14,8 +16,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from poem_jax.calibration.rig_json import read_rig
+from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import name_key, safe_file_names
 
+RIG_FILES = ("rig.json", "calibration/rig.json")
 SUFFIXES = (".jpg", ".jpeg", ".png")
 SINGLE_FRAME = "0000"
 """Name of the only frame of a capture without `frames/`."""
@@ -56,6 +61,21 @@ def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[
             f"frames/<frame>/{camera_names[0]}.jpg; found {_found(folder)}"
         )
     return frames
+
+
+def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) -> Rig:
+    """Read the rig of a capture: the given file, else `rig.json` or `calibration/rig.json` in the folder.
+
+    Raises: FileNotFoundError, ValueError: as `read_rig`.
+    """
+    if rig is not None:
+        return read_rig(rig)
+    places = [Path(folder) / name for name in RIG_FILES]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        looked = " or ".join(map(str, places))
+        raise FileNotFoundError(f"no {looked}: no rig: pass --rig FILE, or put it there")
+    return read_rig(found)
 
 
 def _images(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:

@@ -4,7 +4,6 @@ Every stage takes a stream of frames and gives one on, with its own fields fille
 not need is dropped on the way, so that memory does not grow with the take.
 """
 
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -75,15 +74,3 @@ class Frame(NamedTuple):
     hands: tuple[HandResult, ...] = ()
     warnings: tuple[str, ...] = ()
     """What was noticed at this frame and is true of more than it."""
-
-
-def in_groups(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:
-    """Cut a stream into lists of `size` frames, the last one shorter."""
-    group: list[Frame] = []
-    for frame in frames:
-        group.append(frame)
-        if len(group) == size:
-            yield group
-            group = []
-    if group:
-        yield group

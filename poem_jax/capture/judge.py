@@ -1,15 +1,16 @@
 """The stage `judge`: how well each hand agrees with what the images say, and whether the images agree."""
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.reprojection import Evidence, joints_shown, reprojection_error
+from poem_jax.capture.lens import project_raw
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT
-from poem_jax.typing import Array
+from poem_jax.typing import Array, Bool, Float
 
 SINGLE_SHARE, SEVERAL_SHARE = 0.17, 0.12
 """How far a network's key points may be off, as a share of the hand's extent: in one hand, and in the median
@@ -17,6 +18,15 @@ of `SEVERAL` hands. Of 104 synthetic captures of 4 views, whose images are right
 first in 95 %; of those with two images exchanged 17 % pass, with one mirrored 30 %."""
 SEVERAL = 8
 _ALL_JOINTS = tuple(range(NUM_JOINTS))
+
+
+class Evidence(NamedTuple):
+    """2D points of a hand in the raw photographs."""
+
+    points_px: Float[Array, "view joint 2"]
+    """NaN = unseen."""
+    joints: tuple[int, ...]
+    """Which of the 21 joints they are."""
 
 
 def judge_hands(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
@@ -36,6 +46,37 @@ def judge_hands(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
             for index, hand in enumerate(frame.hands)
         )
         yield frame._replace(hands=hands, warnings=(*frame.warnings, *views.judge(hands)))
+
+
+def joints_shown(
+    joints_world: Float[Array, "21 3"], view_mask: Bool[Array, " view"], rig: Rig
+) -> Float[Array, " view"]:
+    """Return the share of the joints that the lens of each view shows, in or beside its image.
+
+    The others, behind the camera or beyond the fold of the lens, have no reprojection error. Masked views
+    hold NaN.
+    """
+    shares = np.full(len(rig.names), np.nan)
+    for view in np.flatnonzero(view_mask):
+        shares[view] = np.isfinite(project_raw(rig, int(view), joints_world)[0]).all(-1).mean()
+    return shares
+
+
+def reprojection_error(
+    joints_world: Float[Array, "21 3"], evidence: Evidence, rig: Rig
+) -> Float[Array, " view"]:
+    """Return the mean distance in raw pixels per view between the evidence and the projected joints.
+
+    Views without evidence hold NaN.
+    """
+    errors = np.full(len(rig.names), np.nan)
+    for view in np.flatnonzero(np.isfinite(evidence.points_px).all(-1).any(-1)):
+        projected, _ = project_raw(rig, int(view), joints_world[list(evidence.joints)])
+        distances = np.linalg.norm(projected - evidence.points_px[view], axis=-1)
+        seen = np.isfinite(distances)
+        if seen.any():
+            errors[view] = distances[seen].mean()
+    return errors
 
 
 def _evidence(frame: Frame, index: int) -> Evidence:

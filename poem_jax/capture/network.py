@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from poem_jax.batch import Prediction
-from poem_jax.capture.frame import Frame, HandCrops, HandResult, in_groups
-from poem_jax.capture.take import Take
+from poem_jax.capture.frame import Frame, HandCrops, HandResult
+from poem_jax.capture.take import Take, in_groups
 from poem_jax.geometry.cameras import (
     Cameras,
     mirror_intrinsics,

@@ -14,9 +14,8 @@ from poem_jax.capture.boxes_file import (
     read_boxes,
     without_boxes_outside,
 )
-from poem_jax.capture.folder import FramePaths, find_frames
+from poem_jax.capture.folder import FramePaths, find_frames, find_rig
 from poem_jax.capture.frame import Frame
-from poem_jax.capture.rig_file import find_rig
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import safe_file_names
 
@@ -132,6 +131,18 @@ def make_take(rig: Rig, paths: Sequence[FramePaths], hands: HandBoxes) -> Take:
     """
     safe_file_names([frame.name for frame in paths], "names of frames")
     return Take(rig, hands.hand_side, StoredFrames(paths, without_boxes_outside(hands, rig.size_wh)))
+
+
+def in_groups(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:
+    """Cut a stream into lists of `size` frames, the last one shorter."""
+    group: list[Frame] = []
+    for frame in frames:
+        group.append(frame)
+        if len(group) == size:
+            yield group
+            group = []
+    if group:
+        yield group
 
 
 def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:

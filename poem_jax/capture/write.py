@@ -17,12 +17,13 @@ import numpy as np
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.lens import project_raw
 from poem_jax.capture.page_pictures import PageFrames, make_gallery, page_frame
-from poem_jax.capture.prediction_file import PredictionFile
 from poem_jax.capture.report import Clock, Report
 from poem_jax.capture.take import Take
+from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
 from poem_jax.io.animated_glb import AnimatedGlb
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.file_names import safe_file_name, safe_file_names
+from poem_jax.io.growing_npz import GrowingNpz
 from poem_jax.io.meshes import is_own_mesh, write_mesh
 from poem_jax.typing import Array, Float, Int, UInt8
 from poem_jax.viz.overlay import MeshInView, draw_overlay
@@ -32,6 +33,19 @@ MESH_SUFFIXES = (".glb", ".obj")
 PREDICTION, REPORT, PAGE, ANIMATION = "prediction.npz", "report.json", "index.html", "hands.glb"
 SECONDS_PER_FRAME = 1 / 30
 """Of the animation: what video cameras take; a capture does not say."""
+
+_SHAPES = {
+    "joints_world": (NUM_JOINTS, 3),
+    "vertices_world": (NUM_VERTICES, 3),
+    "root_world": (3,),
+    "pose": (NUM_SKELETON_JOINTS, 3),
+    "shape": (NUM_SHAPES,),
+    "translation": (3,),
+    "joint_sigma_m": (NUM_JOINTS,),
+}
+_POINTS = ("joints_world", "vertices_world", "root_world", "translation")
+_WHERE_KNOWN = ("pose", "shape", "translation", "joint_sigma_m")
+"""Left out of `prediction.npz` where no hand has them."""
 
 _log = logging.getLogger(__name__)
 
@@ -110,7 +124,9 @@ class _Writer:
         self.files: list[Path] = []
         self.report = Report(out / REPORT, take)
         self._take, self._out, self._style = take, out, style
-        self._prediction = PredictionFile(out / PREDICTION, take, style.origin_world)
+        self._prediction = GrowingNpz(out / PREDICTION)
+        self._names: list[str] = []
+        self._unknown = set(_WHERE_KNOWN)
         self._animation = AnimatedGlb(
             out / ANIMATION,
             {name: style.faces[side] for name, side in self._hands()},
@@ -134,7 +150,11 @@ class _Writer:
         }
         self._write_meshes(folder, vertices)
         self._write_overlays(folder, frame, vertices)
-        self._prediction.add(frame)
+        self._prediction.append(prediction_entry(frame, self._style.origin_world))
+        self._names.append(frame.name)
+        self._unknown -= {n for n in self._unknown for hand in frame.hands if getattr(hand, n) is not None}
+        if self.report.solved and self._prediction.is_due():
+            self._write_prediction()
         if self._style.animation:
             self._animation.add(vertices)
         if vertices:
@@ -144,7 +164,7 @@ class _Writer:
 
     def finish(self, clock: Clock, about: Mapping[str, Any]) -> None:
         """Write what belongs to all frames."""
-        self.files.append(self._prediction.write())
+        self.files.append(self._write_prediction())
         if self._style.animation:
             self.files.append(self._animation.write())
         elif is_own_mesh(self._out / ANIMATION):
@@ -156,6 +176,14 @@ class _Writer:
         """Let go of what is not needed any more."""
         for part in (self._prediction, self.report, self._animation):
             part.close()
+
+    def _write_prediction(self) -> Path:
+        constant = {
+            "frames": self._names,
+            "hand_side": self._take.hand_sides,
+            "cameras": self._take.rig.names,
+        }
+        return self._prediction.write({k: np.array(v) for k, v in constant.items()}, self._unknown)
 
     def _hands(self) -> Iterable[tuple[str, str]]:
         return zip(self._take.hand_names, self._take.hand_sides, strict=True)
@@ -197,6 +225,30 @@ class _Writer:
         for name, hand, seen in zip(self._take.hand_names, frame.hands, views, strict=True):
             if hand.reason is not None and seen > 1:
                 _log.warning("frame %s: hand '%s' is left out: %s", frame.name, name, hand.reason)
+
+
+def prediction_entry(frame: Frame, origin_world: Float[Array, "3"]) -> dict[str, Array]:
+    """Return what `prediction.npz` holds of a frame; what was not reconstructed is NaN. Metres, world frame.
+
+    `joints_world (H,21,3)`, `vertices_world (H,778,3)`, `root_world (H,3)`, `pose (H,16,3)`, `shape (H,10)`,
+    `translation (H,3)`, `joint_sigma_m (H,21)`, `reprojection_px (H,V)`, `views_used (H,V)`, `valid (H,)`.
+    Points are float64 where `origin_world`, which is added to them, is not zero; else numbers are float32.
+    """
+    hands = frame.hands
+    entry = {
+        "reprojection_px": np.full((len(hands), frame.boxes_px.shape[1]), np.nan, np.float32),
+        "views_used": np.stack([hand.view_mask for hand in hands]),
+        "valid": np.array([hand.reason is None for hand in hands]),
+    }
+    for name, shape in _SHAPES.items():
+        far = name in _POINTS and origin_world.any()
+        entry[name] = np.full((len(hands), *shape), np.nan, np.float64 if far else np.float32)
+    for name in ("reprojection_px", *_SHAPES):
+        for index, hand in enumerate(hands):
+            value = getattr(hand, name)
+            if value is not None:
+                entry[name][index] = value + origin_world if name in _POINTS else value
+    return entry
 
 
 def frame_folder(out: Path, name: str) -> Path:

@@ -26,8 +26,7 @@ class Detect:
 
         from poem_jax.capture.boxes_file import write_boxes
         from poem_jax.capture.detect import detect_hands
-        from poem_jax.capture.folder import find_frames
-        from poem_jax.capture.rig_file import find_rig
+        from poem_jax.capture.folder import find_frames, find_rig
         from poem_jax.io.writable import check_file_is_writable
 
         check_file_is_writable(self.out)

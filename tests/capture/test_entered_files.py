@@ -1,6 +1,7 @@
 """How much code one reconstruction is read in: a newcomer should find the way of an image in few files."""
 
 import sys
+import threading
 from pathlib import Path
 
 import poem_jax
@@ -22,12 +23,15 @@ def test_reconstruct_enters_few_files_of_capture_and_models(micro_model, tmp_pat
         if event == "call" and frame.f_code.co_name != "<module>":
             entered.add(frame.f_code.co_filename)
 
+    capture = demo_folder()
     sys.setprofile(note)
+    threading.setprofile(note)
     try:
-        reconstruct(read_take(demo_folder()), tmp_path / "out", checkpoint=tmp_path / "micro")
+        reconstruct(read_take(capture), tmp_path / "out", checkpoint=tmp_path / "micro")
     finally:
         sys.setprofile(None)
+        threading.setprofile(None)
     ours = {Path(name).relative_to(PACKAGE) for name in entered if name.startswith(str(PACKAGE))}
     counted = sorted(str(path) for path in ours if path.parts[0] in ("capture", "models"))
     assert "capture/pipeline.py" in counted
-    assert len(counted) <= MAX_FILES, counted
+    assert len(counted) <= MAX_FILES, "\n".join(counted)

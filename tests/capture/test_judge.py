@@ -23,7 +23,7 @@ def stub_network(vertices, joints, root, valid=True):
     def answer(_, views, cams):
         number = len(views)
         keypoints = np.full((*views.shape[:2], 1, 2), 32.0)
-        layers = np.zeros((1, number, 799, 3))
+        layers = np.zeros((number, 1, 799, 3))
         solved = valid & cams.view_mask.any(-1)
         return Prediction(vertices, joints, root, keypoints, layers, solved)
 

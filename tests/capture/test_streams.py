@@ -35,7 +35,7 @@ def flat_network(stop=None):
             np.zeros((number, 21, 3)),
             np.zeros((number, 3)),
             np.full((*views.shape[:2], 1, 2), 32.0),
-            np.zeros((1, number, 799, 3)),
+            np.zeros((number, 1, 799, 3)),
             cams.view_mask.any(-1),
         )
 
@@ -112,7 +112,7 @@ def test_a_killed_fit_leaves_a_readable_prediction(tmp_path):
     code = """
 import sys, time
 import numpy as np
-from poem_jax.capture import prediction_file
+from poem_jax.io import growing_npz
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.write import Style, write_results
 from poem_jax.capture.report import Clock
@@ -120,7 +120,7 @@ from poem_jax.capture.take import Take
 from poem_jax.geometry.rig import Rig
 from pathlib import Path
 
-prediction_file.FLUSH_SECONDS = 0.0
+growing_npz.FLUSH_SECONDS = 0.0
 rig = Rig(("a",), np.array([[64, 48]]), np.diag([50.0, 50, 1])[None], np.zeros((1, 5)), np.eye(4)[None])
 
 def frames():

@@ -5,6 +5,8 @@ import pytest
 
 from poem_jax.capture import page_pictures, write
 from poem_jax.capture.boxes_file import write_boxes
+from poem_jax.capture.frame import Frame, HandResult
+from poem_jax.capture.write import frame_folder, prediction_entry
 
 
 def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
@@ -57,3 +59,49 @@ def test_results_need_a_folder(make_capture, tmp_path, run):
         with pytest.raises(ValueError, match=r"results go to a folder, and .*file is a file; give another"):
             run(capture, out)
     assert (tmp_path / "file").read_text() == "keep"
+
+
+def found(value, **more):
+    points = {"vertices_world": (778, 3), "joints_world": (21, 3), "root_world": (3,)}
+    arrays = {name: np.full(shape, value, np.float32) for name, shape in points.items()}
+    return HandResult(np.ones(3, bool), reprojection_px=np.array([1.0, np.nan, value]), **arrays, **more)
+
+
+def test_the_entry_of_a_frame_is_nan_where_a_hand_is_lost():
+    lost = HandResult(np.array([True, False, False]), "seen in 1 view(s); two are needed")
+    frame = Frame("a", np.full((2, 3, 4), np.nan), hands=(lost, found(2.0, shape=np.arange(10.0))))
+    entry = prediction_entry(frame, np.zeros(3))
+    assert entry["valid"].tolist() == [False, True]
+    assert entry["views_used"].tolist() == [[True, False, False], [True, True, True]]
+    assert np.isnan(entry["vertices_world"][0]).all()
+    assert (entry["vertices_world"][1] == 2).all()
+    np.testing.assert_array_equal(entry["reprojection_px"][1], [1, np.nan, 2])
+    np.testing.assert_array_equal(entry["shape"][1], np.arange(10))
+    assert np.isnan(entry["pose"]).all()
+    assert entry["joints_world"].dtype == np.float32
+
+
+def test_a_far_world_keeps_its_millimetres():
+    """500 km from the origin float32 would round by 3 cm."""
+    origin = np.array([500e3, 4500e3, 300.0])
+    place = np.array([0.001, 0.002, 0.003])
+    frame = Frame("a", np.full((1, 3, 4), np.nan), hands=(found(0.001, translation=place),))
+    entry = prediction_entry(frame, origin)
+    np.testing.assert_allclose(entry["joints_world"][0] - origin, 0.001, atol=1e-6)
+    np.testing.assert_allclose(entry["translation"][0] - origin, place, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["../mine", "/tmp/mine", "", ".", "..", "a/b", "prediction.npz", "a\0b", "x" * 300]
+)
+def test_nothing_is_written_outside_the_folder(tmp_path, name):
+    with pytest.raises(ValueError, match="name"):
+        frame_folder(tmp_path, name)
+
+
+def test_a_link_that_leads_elsewhere_is_not_followed(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "0000").symlink_to(tmp_path / "mine")
+    with pytest.raises(ValueError, match="is a link that leads out of the folder of results"):
+        frame_folder(tmp_path / "out", "0000")
