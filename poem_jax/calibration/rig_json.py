@@ -89,7 +89,7 @@ def read_rig(path: str | os.PathLike) -> Rig:
     rig.T_cam_from_world[:, :3, 3] *= scale
     _check_far_rotations(rig, path)
     _check_distinct(rig, path)
-    _warn_of_unread_keys(content, path)
+    _warn_of_keys(content, path)
     return rig
 
 
@@ -193,13 +193,22 @@ def _check_distinct(rig: Rig, path: Path) -> None:
             )
 
 
-def _warn_of_unread_keys(content: dict[str, Any], path: Path) -> None:
-    """Name the lists and objects of a rig that nothing reads: what they say of the cameras counts not."""
-    found = {key for key in content.keys() - _KEYS if isinstance(content[key], list | dict)}
+def _warn_of_keys(content: dict[str, Any], path: Path) -> None:
+    """Say which lists and objects nothing reads, and which are taken for `dist`, though of another name."""
+    unread = {key for key in content.keys() - _KEYS if isinstance(content[key], list | dict)}
+    lenses = set()
     for camera in content["cameras"]:
-        found |= {key for key in camera.keys() - _CAMERA_KEYS if isinstance(camera[key], list | dict)}
-    if found:
-        _log.warning("%s: %s are not read", path, ", ".join(f"`{key}`" for key in sorted(found)))
+        unread |= {key for key in camera.keys() - _CAMERA_KEYS if isinstance(camera[key], list | dict)}
+        if "dist" not in camera:
+            lenses |= {key for key in DISTORTION_KEYS if camera.get(key)}
+    if lenses:
+        _log.warning("%s: %s is read as `dist`, k1 k2 p1 p2 k3 (k4 k5 k6)", path, _quoted(lenses))
+    if unread:
+        _log.warning("%s: %s are not read", path, _quoted(unread))
+
+
+def _quoted(keys: set[str]) -> str:
+    return ", ".join(f"`{key}`" for key in sorted(keys))
 
 
 def _entry(camera: dict[str, Any], key: str, where: str) -> Any:

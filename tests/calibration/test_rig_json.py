@@ -84,10 +84,13 @@ def test_a_rational_lens_among_others(tmp_path, content, terms):
 
 
 @pytest.mark.parametrize("key", ["distortions", "distCoef", "dist_coeffs", "distortion", "D"])
-def test_lens_terms_under_the_names_of_other_tools(tmp_path, content, rig, key):
+def test_lens_terms_under_the_names_of_other_tools(tmp_path, content, rig, key, caplog):
+    read_rig(rewrite(tmp_path, content))
+    assert not caplog.records
     for camera in content["cameras"]:
         camera[key] = camera.pop("dist")
     np.testing.assert_array_equal(read_rig(rewrite(tmp_path, content)).dist, rig.dist)
+    assert f"`{key}` is read as `dist`" in caplog.text
 
 
 def fisheye(content):
