@@ -81,9 +81,11 @@ def intrinsics(value: Any, where: str) -> Float[Array, "3 3"]:
     K = numbers(value, (3, 3), f"{where}: `K`")
     if has_form_of_intrinsics(K) and K[0, 0] > 0 and K[1, 1] > 0:
         return K
+    with np.errstate(all="ignore"):
+        scaled = K / K[2, 2]
     if has_form_of_intrinsics(K.T):
         hint = "; it is transposed"
-    elif K[2, 2] not in (0, 1) and has_form_of_intrinsics(K / K[2, 2]):
+    elif K[2, 2] not in (0, 1) and has_form_of_intrinsics(scaled):
         hint = f"; divide it by its last entry, {K[2, 2]:g}"
     elif has_form_of_intrinsics(K):
         hint = "; for images that are flipped flip the image, not `K`"

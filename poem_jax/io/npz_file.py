@@ -25,6 +25,8 @@ MAX_GROWTH, FREE_BYTES = 100, 2**26
 arrays that are all NaN, but no long take is."""
 MAX_ARRAYS = 1000
 """Arrays in a file; ours have up to 20."""
+MAX_CAUSE = 300
+"""Characters of another library's message that are passed on."""
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _KINDS = "biufUS"
 """Truth values, whole numbers, floats and text."""
@@ -136,9 +138,11 @@ def _read_array(stream: BufferedIOBase, size: int) -> Array:
 
 
 def _cause(error: Exception) -> str:
+    # Libraries quote what stands in the place of a name or a header, however long.
     if type(error) is ValueError:
-        return str(error)
-    return f"{type(error).__name__}: {error}. Is the file cut short, damaged or of another kind?"
+        return str(error)[: 2 * MAX_CAUSE]
+    shown = str(error)[:MAX_CAUSE]
+    return f"{type(error).__name__}: {shown}. Is the file cut short, damaged or of another kind?"
 
 
 def _kind(dtype: np.dtype) -> str:

@@ -28,6 +28,8 @@ _PROTOCOL = 1001
 _USUAL_NAMES = ("state_dict", "model_state_dict", "model", "net", "network")
 _MOST_GROWTH, _MOST_BESIDES = 16, 2**26
 """The arrays may take this many times the file's size, and this many bytes: tensors may share storages."""
+_MOST_CAUSE = 300
+"""Characters of zipfile's message, which quotes what stands in the place of a name, that are passed on."""
 _ZIP_PROBLEMS = (
     zipfile.BadZipFile,
     NotImplementedError,
@@ -167,7 +169,8 @@ class _ZipForm:
         except _ZIP_PROBLEMS as error:
             raise ValueError(
                 f"{self._source} must be a whole zip archive of torch.save; reading it stopped with "
-                f"{type(error).__name__}: {error}. Is the file cut short or damaged? Fetch it again."
+                f"{type(error).__name__}: {str(error)[:_MOST_CAUSE]}. Is the file cut short or damaged? "
+                "Fetch it again."
             ) from error
 
 

@@ -15,6 +15,7 @@ from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.checksums import check_checksums, write_checksums
+from poem_jax.io.json_file import read_json
 from poem_jax.models.apply import init
 from poem_jax.training.config import TrainConfig, config_json, differences, flatten_config, git_commit
 from poem_jax.training.state import TrainState, create_state, evaluation_params
@@ -205,7 +206,9 @@ def check_same_config(run_dir: Path, config: TrainConfig) -> None:
     file = run_dir / _CONFIG
     if not file.is_file() or not (run_dir / _FOLDER).is_dir():
         return
-    stored = json.loads(file.read_text(encoding="utf-8"))
+    stored = read_json(file, what="config of a run")
+    if not isinstance(stored, dict):
+        raise ValueError(f"{file} must hold the config of a run; got a {type(stored).__name__}. Remove it")
     changed = differences(stored, _as_stored(config))
     if changed and not config.train.allow_config_change:
         raise ValueError(

@@ -10,6 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from poem_jax.io.atomic import whole_file
+from poem_jax.io.json_file import parse_json
 from poem_jax.training.config import TrainConfig
 
 log = logging.getLogger(__name__)
@@ -80,7 +81,7 @@ def forget_after(file: Path, step: int) -> None:
 
 def _is_until(line: str, step: int) -> bool:
     try:
-        return line.endswith("\n") and json.loads(line)["step"] <= step
+        return line.endswith("\n") and parse_json(line, "a line", allow_nan=True)["step"] <= step
     except (ValueError, TypeError, KeyError):
         return False
 
