@@ -29,24 +29,16 @@ from poem_jax.geometry.triangulation import triangulate
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, ROOT_JOINT, join_queries, split_queries
 from poem_jax.models.config import (
-    AttentionKeys,
-    BehindCamera,
     Config,
-    CoordinateUpdate,
     DecoderConfig,
     DecoderOutput,
-    FeatureFusion,
-    FirstNeighbours,
+    Design,
     HeatActivation,
     HRNetConfig,
-    Layout,
     NeighbourSearch,
-    PositionCode,
     QueryStart,
     Similarity,
-    SingleView,
     Stem,
-    VectorForm,
     ViewWeights,
 )
 from poem_jax.models.hand_output import HandParameters, pose_by_joints, root_relative_mesh
@@ -250,7 +242,7 @@ def plain_heat_maps(
 def plain_features(params: Params, levels: list[Array], config: Config) -> Float[Array, "image h w c"]:
     """Return the maps that the basis points sample, without the position code."""
     w = _weights(params)["features"]
-    if config.features.fusion is FeatureFusion.TOP_DOWN:
+    if config.features.design is Design.PAPER:
         x = _top_down(levels, w.get("branch", {}), config.backbone.strides.index(config.features.stride))
     else:
         x = levels[0]
@@ -295,7 +287,7 @@ def plain_sampling_and_aggregation(
     uv_px, depth = project(cams.K, cams.T_cam_from_world, points[:, None])
     share = uv_px / jnp.array(config.image_hw[::-1], uv_px.dtype)
     sampled = sample_bilinear(maps, share * jnp.array(maps.shape[-3:-1][::-1], uv_px.dtype))
-    if config.basis.behind_camera is BehindCamera.ZEROS:
+    if config.features.design is Design.PAPER:
         seen = (depth > 0)[..., None]
         sampled, share = jnp.where(seen, sampled, 0), jnp.where(seen, share, 0)
     return plain_aggregation(params, sampled, share, config)
@@ -305,7 +297,7 @@ def plain_map_position(
     params: Params, maps: Float[Array, "batch view h w c"], config: Config
 ) -> Float[Array, "batch view h w c"]:
     """Add the position code to the feature maps, if it belongs there."""
-    if config.features.position_code is not PositionCode.VIEW_ROW_COLUMN:
+    if config.features.design is Design.PAPER:
         return maps
     return maps + _view_row_column_code(_weights(params)["features"]["position"]["mix"], maps.shape)
 
@@ -321,10 +313,10 @@ def plain_aggregation(
     `share` holds the projections as (u / W, v / H), whose code is added to the features if it belongs there.
     """
     w = _weights(params)["aggregation"]
-    if config.features.position_code is PositionCode.PROJECTED_POINT:
+    if config.features.design is Design.PAPER:
         sampled = sampled + _sine_code(share, sampled.shape[-1])
     batch, views, points, c = sampled.shape
-    if config.aggregation.layout is Layout.ROW_MAJOR:
+    if config.aggregation.design is Design.RELEASE:
         tokens = sampled.transpose(0, 1, 3, 2).reshape(batch, points, views, c)
     else:
         tokens = sampled.transpose(0, 2, 1, 3)
@@ -335,7 +327,7 @@ def plain_aggregation(
         similarity = similarity / theta.shape[-1]
     mixed = jnp.einsum("bnv,bnvc->bnc", similarity, sources)
     if views == 1:
-        if config.aggregation.single_view is SingleView.PASS:
+        if config.aggregation.design is Design.PAPER:
             return tokens[:, :, 0]
         mixed = first
     return tokens[:, :, 0] + _two_layers(mixed, w["phi_in"], w["phi_out"]) / views
@@ -375,7 +367,7 @@ def _triangulated(
         squares = off_u[..., None, :] ** 2 + off_v[..., :, None] ** 2
         weights = 1 / jnp.maximum(jnp.sum(heat * squares, (-2, -1)), 0.25)
     K, T = cams.K, cams.T_cam_from_world
-    joints, solved = triangulate(uv_px, K, T, weights, normalise_rows=config.root.unit_rows)
+    joints, solved = triangulate(uv_px, K, T, weights, normalise_rows=config.root.design is Design.PAPER)
     _, depth = project(K, T, joints[:, None])
     return joints, solved & jnp.all(depth > 0, 1)
 
@@ -428,8 +420,8 @@ def plain_decoder(
         features = features + _two_layers(points, w["locate"]["hidden"], w["locate"]["out"])
     given, found, moved, around = iter(neighbours or []), [], [], []
     for i, layer in enumerate(_rows(w["layers"])):
-        clouds = [points, queries] if decoder.vector_form is VectorForm.QUERIES_THEN_BASIS else [points]
-        if i == 0 and decoder.first_neighbours is FirstNeighbours.ANCHORS:
+        clouds = [points, queries] if decoder.layer is Design.RELEASE else [points]
+        if i == 0 and decoder.layer is Design.RELEASE:
             around = [_anchors(params, queries)] * len(clouds)
         elif i == 0 or decoder.neighbour_search is NeighbourSearch.EVERY_LAYER:
             sets = [next(given) if neighbours else _nearest(queries, c, decoder) for c in clouds]
@@ -458,15 +450,15 @@ def _anchors(params: Params, queries: Array) -> tuple[Array, Array]:
 def _layer(
     e: Array, x: Array, features: Array, around: list, w: Weights, decoder: DecoderConfig
 ) -> tuple[Array, Array]:
-    epsilon, norms = decoder.layer_norm_epsilon, _rows(w["norms"])
-    if decoder.shared_embedding:
+    epsilon, norms = 1e-12 if decoder.layer is Design.RELEASE else 1e-5, _rows(w["norms"])
+    if decoder.layer is Design.RELEASE:
         e, features = _linear(e, w["embed"]), _linear(features, w["embed"])
     basis = features[:, :: decoder.cross_attention_basis_stride]
-    read = e if decoder.first_attention is AttentionKeys.QUERIES else basis
+    read = e if decoder.layer is Design.PAPER else basis
     e = _layer_norm(e + _attention(e, read, w["self_attention"], decoder.num_heads), norms[0], epsilon)
     e = _layer_norm(e + _attention(e, basis, w["cross_attention"], decoder.num_heads), norms[1], epsilon)
     vector, near = w["vector_attention"], around[0]
-    if decoder.vector_form is VectorForm.BASIS:
+    if decoder.layer is Design.PAPER:
         e = _layer_norm(e + _vector_attention(e, x, features, near, vector), norms[2], epsilon)
     else:
         scale, among, to_basis = e.shape[-1] ** -0.5, vector["queries"], vector["basis"]
@@ -476,7 +468,7 @@ def _layer(
         mapped = _linear(features, to_basis["before"])
         read = _vector_attention(e, x, mapped, near, to_basis["attention"], scale)
         e = e + _linear(read, to_basis["after"])
-    if decoder.coordinate_update is CoordinateUpdate.FEED_FORWARD:
+    if decoder.layer is Design.PAPER:
         moves = "feed_forward" in w
         return e, x + _offsets(e, w["feed_forward"]) if moves else x
     if "branch" in w:
@@ -525,7 +517,7 @@ def plain_hand(
 ) -> Float[Array, "batch query 3"]:
     """Return the query points of the hand whose pose and shape the last embeddings tell, about the root."""
     w, (batch, query, c) = _weights(params)["regressor"], e.shape
-    by_name = config.decoder.pooling is Layout.BY_NAME
+    by_name = config.decoder.layer is Design.PAPER
     channels = e.transpose(0, 2, 1) if by_name else e.reshape(batch, c, query)
     numbers = _linear(_linear(channels, w["pool"])[..., 0], w["regress"])
     sixd, shape = numbers[:, : 6 * NUM_SKELETON_JOINTS], numbers[:, 6 * NUM_SKELETON_JOINTS :]

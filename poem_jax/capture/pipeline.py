@@ -108,7 +108,7 @@ def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Netwo
     config = network.config
     frames = clock.timed("judge_boxes", judge_boxes(frames, take.rig))
     frames = clock.timed("read", read_images(frames, take.rig, go_on=take.num_frames != 1))
-    frames = clock.timed("crop", crop_hands(frames, take.rig, _crop_ratio(config), config.image_hw))
+    frames = clock.timed("crop", crop_hands(frames, take.rig, config.crop.ratio, config.image_hw))
     return clock.timed("predict", predict_hands(frames, take, network))
 
 
@@ -138,7 +138,3 @@ def _run(
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
     style = Style(faces, single if meshes is None else meshes, not single, origin_world)
     return write_results(frames, take, out, style, clock, about)
-
-
-def _crop_ratio(config: Any) -> float:
-    return config.crop.ratio if hasattr(config, "crop") else 1.5

@@ -22,7 +22,11 @@ config = experiment(
     name="v2_base_synthetic",
     model=preset("v2-base"),
     data=DataConfig(
-        synthetic=replace(benchmark, image_hw=(256, 256)),
+        synthetic=replace(
+            benchmark,
+            image_hw=(256, 256),
+            crop=replace(benchmark.crop, expand_ratio=preset("v2-base").crop.ratio),
+        ),
         seed=1,
         batches=(BatchShape(num_views=8, batch_size=32, min_views=1),),
         workers=8,

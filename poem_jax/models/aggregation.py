@@ -3,15 +3,15 @@
 Letters: f1 = feature of the primary view, fj = those of the source views, N = number of valid views.
 
 The released weights were trained on tokens that are not features of a basis point: the samples of all
-views, (view, channel, point) in memory, are read as (point, view, channel). `Layout.ROW_MAJOR` does the same,
-for any number of valid views among the padded ones.
+views, (view, channel, point) in memory, are read as (point, view, channel). So does the release's design, for
+any number of valid views among the padded ones.
 """
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from poem_jax.models.config import AggregationConfig, Layout, Similarity, SingleView
+from poem_jax.models.config import AggregationConfig, Design, Similarity
 from poem_jax.models.layers import linear
 from poem_jax.typing import Array, Bool, Float, Int
 
@@ -23,10 +23,10 @@ class ProjectiveAggregation(nnx.Module):
     """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N; by default exactly f1 where one view is valid."""
 
     def __init__(self, config: AggregationConfig, width: int, *, rngs: nnx.Rngs) -> None:
-        self.config = config
+        self.is_release = config.design is Design.RELEASE
         half = width // 2
         self.theta_in, self.theta_out = linear(width, width, rngs=rngs), linear(width, half, rngs=rngs)
-        hidden = half if config.narrow_phi else width
+        hidden = half if self.is_release else width
         self.phi_in, self.phi_out = linear(half, hidden, rngs=rngs), linear(hidden, width, rngs=rngs)
         self.similarity_scale = 1.0 / half if config.similarity is Similarity.MEAN else 1.0
 
@@ -36,8 +36,8 @@ class ProjectiveAggregation(nnx.Module):
         view_mask: Bool[Array, "batch view"],
         primary: Int[Array, " batch"],
     ) -> Float[Array, "batch basis c"]:
-        """Fuse the valid views into view `primary`; the row-major layout wants the valid views first."""
-        if self.config.layout is Layout.ROW_MAJOR:
+        """Fuse the valid views into view `primary`; the release's design wants the valid views first."""
+        if self.is_release:
             features = row_major_tokens(features, jnp.sum(view_mask, axis=-1))
         batch, _, points, c = features.shape
         if points % _POINTS_AT_A_TIME or points == _POINTS_AT_A_TIME:
@@ -61,10 +61,10 @@ class ProjectiveAggregation(nnx.Module):
         return _view(features, primary) + self._update(mixed, first, count)
 
     def _update(self, from_sources: Array, first: Array, count: Array) -> Float[Array, "batch point c"]:
-        if self.config.single_view is SingleView.RESIDUAL:
+        if self.is_release:
             from_sources = jnp.where(count == 1, first, from_sources)
         update = self.phi_out(jax.nn.relu(self.phi_in(from_sources))) / jnp.maximum(count, 1)
-        return update if self.config.single_view is SingleView.RESIDUAL else jnp.where(count > 1, update, 0)
+        return update if self.is_release else jnp.where(count > 1, update, 0)
 
 
 def row_major_tokens(

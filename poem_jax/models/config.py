@@ -1,7 +1,7 @@
 """Configuration of a POEM model: frozen dataclasses nested by owner.
 
-A choice that the paper, the released models and our own make differently is a named field of the part that
-has it; the first entry of each enumeration is the paper's. Cross-field rules are checked on construction.
+Where the paper and the released models differ in a whole part, the part names its `Design`; single choices
+are fields of the part that has them. Cross-field rules are checked on construction.
 """
 
 import enum
@@ -36,6 +36,13 @@ def _require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
             f"`{name}` must be whole and at least 1; got {value}",
         )
         require(max(entries, default=0) <= most, f"`{name}` must be at most {most}; got {value}")
+
+
+class Design(enum.StrEnum):
+    """Whose design a part follows, where paper and release differ in many things at once."""
+
+    PAPER = "paper"
+    RELEASE = "release"
 
 
 class Stem(enum.StrEnum):
@@ -143,50 +150,38 @@ class RootConfig:
     """1 = the root alone (paper); 21 = all joints, of which joint 9 is the root."""
     stride: int = 8
     """Pixels per heat-map cell."""
-    pooling: int = 1
-    """The branch ends so many times finer, and is max-pooled to `stride` (release: 2)."""
-    cell_offset: float = 0.5
-    """Cell i stands for pixel `stride` x (i + `cell_offset`); the release has 0."""
+    design: Design = Design.PAPER
+    """The release's branch has biases and ends at half the stride, to be max-pooled; cell i stands for pixel
+    `stride` x i; 1e-6 is added to a map's sum; the rows of the triangulation stay raw pixels."""
     activation: HeatActivation = HeatActivation.SIGMOID
-    sum_epsilon: float = 0.0
-    """Added to a sigmoid map's sum before its expectation is divided by it; the release has 1e-6."""
     view_weights: ViewWeights = ViewWeights.EQUAL
-    unit_rows: bool = True
-    """Scale every row of the triangulation to unit norm; the release keeps raw pixels."""
 
     def __post_init__(self) -> None:
         require(
             self.num_joints in (1, NUM_JOINTS),
             f"`num_joints` must be 1 (the root) or {NUM_JOINTS} (all joints); got {self.num_joints}",
         )
-        _require_counts(self, "stride", "pooling")
-        require(
-            self.stride % self.pooling == 0,
-            f"`pooling` must divide `stride` = {self.stride}; got {self.pooling}",
-        )
+        _require_counts(self, "stride")
+
+    @property
+    def pooling(self) -> int:
+        """The branch ends so many times finer, and is max-pooled to `stride`."""
+        return 2 if self.design is Design.RELEASE else 1
+
+    @property
+    def cell_offset(self) -> float:
+        """Cell i stands for pixel `stride` x (i + `cell_offset`)."""
+        return 0.0 if self.design is Design.RELEASE else 0.5
+
+    @property
+    def sum_epsilon(self) -> float:
+        """Added to a sigmoid map's sum before its expectation is divided by it."""
+        return 1e-6 if self.design is Design.RELEASE else 0.0
 
     @property
     def branch_stride(self) -> int:
         """Pixels per cell where the branch ends."""
         return self.stride // self.pooling
-
-
-class FeatureFusion(enum.StrEnum):
-    """How the feature branch joins the trunk's maps."""
-
-    TOP_DOWN = "top_down"
-    """The heat-map branch's design: enlarge, concatenate the finer map, convolve."""
-    BOTTOM_UP = "bottom_up"
-    """Convolve with stride 2, add the coarser map, to the coarsest; then enlarge once (release)."""
-
-
-class PositionCode(enum.StrEnum):
-    """What tells a sampled feature where it comes from."""
-
-    PROJECTED_POINT = "projected_point"
-    """Sines of the projected point, added to the samples."""
-    VIEW_ROW_COLUMN = "view_row_column"
-    """Sines of the number of the view, the row and the column, mixed and added to the map (release)."""
 
 
 @dataclass(frozen=True)
@@ -195,16 +190,12 @@ class FeatureConfig:
 
     stride: int = 8
     """Pixels per cell."""
-    fusion: FeatureFusion = FeatureFusion.TOP_DOWN
-    position_code: PositionCode = PositionCode.PROJECTED_POINT
-
-
-class BehindCamera(enum.StrEnum):
-    """What a basis point behind a camera reads there."""
-
-    ZEROS = "zeros"
-    MIRRORED = "mirrored"
-    """Whatever lies where it projects through the centre (release)."""
+    design: Design = Design.PAPER
+    """Paper: the heat maps' branch (enlarge, concatenate the finer map, convolve); sines of the projected
+    point are added to its sample; points behind a camera sample zeros. Release: convolve with stride 2 and
+    add the coarser map, to the coarsest, then enlarge once; sines of the number of the view, the row and the
+    column are mixed and added to the map; points behind a camera sample where they project through its
+    centre."""
 
 
 class BasisSampling(enum.StrEnum):
@@ -225,7 +216,6 @@ class BasisConfig:
     """Metres."""
     sampling: BasisSampling = BasisSampling.BALL
     seed: int = 0
-    behind_camera: BehindCamera = BehindCamera.ZEROS
 
     def __post_init__(self) -> None:
         _require_counts(self, "num_points")
@@ -243,68 +233,14 @@ class Similarity(enum.StrEnum):
     """The same divided by its number of terms, so that its size does not grow with the width."""
 
 
-class Layout(enum.StrEnum):
-    """How an array gets axes in another order."""
-
-    BY_NAME = "by_name"
-    """The axes are moved; every number keeps its meaning."""
-    ROW_MAJOR = "row_major"
-    """The same memory is read under another shape, which mixes the axes; the released weights expect it."""
-
-
-class SingleView(enum.StrEnum):
-    """What the aggregation does where only one view is valid."""
-
-    PASS = "pass"
-    """Nothing: the features are those of the view."""
-    RESIDUAL = "residual"
-    """Adds phi(theta(f1)) (release)."""
-
-
 @dataclass(frozen=True)
 class AggregationConfig:
     """Fusion of the views' features."""
 
     similarity: Similarity = Similarity.DOT
-    layout: Layout = Layout.BY_NAME
-    """From (view, channel, point), as sampled, to (point, view, channel)."""
-    single_view: SingleView = SingleView.PASS
-    narrow_phi: bool = False
-    """phi's hidden layer is as narrow as its input; else phi is theta's mirror image."""
-
-
-class AttentionKeys(enum.StrEnum):
-    """What the first scalar attention of a layer reads; the second reads the basis."""
-
-    QUERIES = "queries"
-    BASIS = "basis"
-
-
-class FirstNeighbours(enum.StrEnum):
-    """Whom the vector attentions of the first layer read."""
-
-    NEAREST = "nearest"
-    ANCHORS = "anchors"
-    """Fixed rows at fixed positions, the same for every query, of queries and basis alike (release)."""
-
-
-class VectorForm(enum.StrEnum):
-    """The vector attention of a layer."""
-
-    BASIS = "basis"
-    """Queries read basis points; a residual sum and layer norm follow."""
-    QUERIES_THEN_BASIS = "queries_then_basis"
-    """Queries read queries, then basis points; each between two linear maps, with a residual sum, no norm,
-    and logits over the root of the width (release)."""
-
-
-class CoordinateUpdate(enum.StrEnum):
-    """What moves the query points."""
-
-    FEED_FORWARD = "feed_forward"
-    """The feed-forward network regresses offsets."""
-    BRANCH_BEFORE = "branch_before"
-    """A branch of two layers; the feed-forward network, a residual of the embeddings, follows (release)."""
+    design: Design = Design.PAPER
+    """The release reads its samples, (view, channel, point) in memory, as (point, view, channel), which mixes
+    them; one view alone gets phi(theta(f1)) added; phi's hidden layer is as narrow as its input."""
 
 
 class NeighbourSearch(enum.StrEnum):
@@ -341,14 +277,10 @@ class DecoderConfig:
     num_neighbours: int = 32
     ffn_expansion: int = 4
     """Hidden width of the feed-forward network over the width of the embeddings."""
-    query_order: QueryOrder = QueryOrder.VERTICES_FIRST
-    first_attention: AttentionKeys = AttentionKeys.QUERIES
-    vector_form: VectorForm = VectorForm.BASIS
-    first_neighbours: FirstNeighbours = FirstNeighbours.NEAREST
-    coordinate_update: CoordinateUpdate = CoordinateUpdate.FEED_FORWARD
-    shared_embedding: bool = False
-    """Every layer begins with one linear map of queries and basis features."""
-    layer_norm_epsilon: float = 1e-5
+    layer: Design = Design.PAPER
+    """Paper: queries read each other, then the basis, then their nearest basis points; the feed-forward
+    network regresses offsets. Release: queries read the basis twice, then near queries, then near basis
+    points, in the first layer fixed ones; a branch regresses offsets before the feed-forward network."""
     dropout: float = 0.0
     """Share of numbers dropped in training, where the release drops them."""
     query_start: QueryStart = QueryStart.TEMPLATE
@@ -358,17 +290,33 @@ class DecoderConfig:
     embed_coordinates: bool = False
     """Add a learned embedding of the 3D coordinates to queries (every layer) and basis features (once)."""
     output: DecoderOutput = DecoderOutput.OFFSETS
-    pooling: Layout = Layout.BY_NAME
-    """From (query, channel) to (channel, query), before the parametric output pools the queries."""
 
     def __post_init__(self) -> None:
         _require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
         _require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
         require(0 <= self.dropout < 1, f"`dropout` must be in [0, 1); got {self.dropout}")
         require(
-            self.vector_form is VectorForm.BASIS or self.num_neighbours <= NUM_QUERIES,
+            self.layer is Design.PAPER or self.num_neighbours <= NUM_QUERIES,
             f"`num_neighbours` must not exceed the {NUM_QUERIES} queries; got {self.num_neighbours}",
         )
+
+    @property
+    def query_order(self) -> QueryOrder:
+        """Layout of the 799 queries."""
+        return QueryOrder.JOINTS_FIRST if self.layer is Design.RELEASE else QueryOrder.VERTICES_FIRST
+
+
+@dataclass(frozen=True)
+class CropConfig:
+    """The pictures that a model was trained on."""
+
+    ratio: float = 2.0
+    """Side of the square crop over the longer side of the bounding box of the 21 joints."""
+    upright: bool = False
+    """Crops are rolled so that hands stand upright."""
+
+    def __post_init__(self) -> None:
+        require(0 < self.ratio < math.inf, f"`ratio` must be positive and finite; got {self.ratio}")
 
 
 @dataclass(frozen=True)
@@ -378,11 +326,10 @@ class Config:
     image_hw: tuple[int, int] = (256, 256)
     image_mean: float = 0.5
     image_std: float = 1.0
+    crop: CropConfig = CropConfig()
     width: int = 256
     """Channels d of basis features and query embeddings."""
     backbone: HRNetConfig | ResNetConfig = field(default_factory=HRNetConfig)
-    branch_bias: bool = False
-    """The convolutions of the two branches have a bias before their batch norm."""
     root: RootConfig = RootConfig()
     features: FeatureConfig = FeatureConfig()
     basis: BasisConfig = BasisConfig()
@@ -412,8 +359,8 @@ class Config:
         ):
             require(stride in strides, f"`{name}` must be one of the trunk's strides {strides}; got {stride}")
         require(
-            self.features.fusion is FeatureFusion.TOP_DOWN or self.features.stride == strides[-2],
-            f"`features.stride` must be {strides[-2]} with `features.fusion` = bottom_up, which enlarges the "
+            self.features.design is Design.PAPER or self.features.stride == strides[-2],
+            f"`features.stride` must be {strides[-2]} with `features.design` = release, which enlarges the "
             f"trunk's coarsest map once; got {self.features.stride}",
         )
         require(
@@ -426,8 +373,8 @@ class Config:
             f"got {self.decoder.num_neighbours}",
         )
         require(
-            self.decoder.first_neighbours is FirstNeighbours.NEAREST or self.basis.num_points >= NUM_QUERIES,
-            f"`decoder.first_neighbours` = anchors names rows of the {NUM_QUERIES} queries and of the basis "
+            self.decoder.layer is Design.PAPER or self.basis.num_points >= NUM_QUERIES,
+            f"`decoder.layer` = release names rows of the {NUM_QUERIES} queries and of the basis "
             f"alike, so `basis.num_points` must be at least {NUM_QUERIES}; got {self.basis.num_points}",
         )
         require(

@@ -15,8 +15,33 @@ from poem_jax.models.config import Config, require
 
 _T = TypeVar("_T")
 _KIND = "kind"
+_SYNTHETIC_CROP = 1.5
+"""Crop ratio of our own models, which files of earlier versions do not say."""
 _MOVED = {"feature_stride": ("features", "stride"), "similarity": ("aggregation", "similarity")}
-"""Keys of the whole model that belong to one of its parts now; checkpoints of earlier versions have them."""
+"""Keys of the whole model that belong to one of its parts now; files of earlier versions have them."""
+_ONE_BY_ONE = {
+    "branch_bias": ("features", False, True),
+    "root.pooling": ("root", 1, 2),
+    "root.cell_offset": ("root", 0.5, 0.0),
+    "root.sum_epsilon": ("root", 0.0, 1e-6),
+    "root.unit_rows": ("root", True, False),
+    "features.fusion": ("features", "top_down", "bottom_up"),
+    "features.position_code": ("features", "projected_point", "view_row_column"),
+    "basis.behind_camera": ("features", "zeros", "mirrored"),
+    "aggregation.layout": ("aggregation", "by_name", "row_major"),
+    "aggregation.single_view": ("aggregation", "pass", "residual"),
+    "aggregation.narrow_phi": ("aggregation", False, True),
+    "decoder.query_order": ("decoder", "vertices_first", "joints_first"),
+    "decoder.first_attention": ("decoder", "queries", "basis"),
+    "decoder.vector_form": ("decoder", "basis", "queries_then_basis"),
+    "decoder.first_neighbours": ("decoder", "nearest", "anchors"),
+    "decoder.coordinate_update": ("decoder", "feed_forward", "branch_before"),
+    "decoder.shared_embedding": ("decoder", False, True),
+    "decoder.layer_norm_epsilon": ("decoder", 1e-5, 1e-12),
+    "decoder.pooling": ("decoder", "by_name", "row_major"),
+}
+"""What files of earlier versions say one by one: the part that names its design now, and what the key said in
+the paper's and in the release's."""
 
 
 def to_json(config: Config) -> str:
@@ -36,17 +61,46 @@ def from_json(text: str) -> Config:
 
 def from_values(values: Any) -> Config:
     """Read a config from the values of its JSON form; errors as in `from_json`."""
-    return _decode(_at_their_new_place(values), Config, "config")
+    return _decode(_of_today(values) if isinstance(values, dict) else values, Config, "config")
 
 
-def _at_their_new_place(values: Any) -> Any:
-    if not isinstance(values, dict):
-        return values
-    kept = {key: value for key, value in values.items() if key not in _MOVED}
+def _of_today(values: dict[str, Any]) -> dict[str, Any]:
+    """Bring what a file of an earlier version says into today's form."""
+    kept = {key: dict(value) if isinstance(value, dict) else value for key, value in values.items()}
     for key, (part, name) in _MOVED.items():
-        if key in values:
-            kept[part] = {**kept.get(part, {}), name: values[key]}
+        if key in kept:
+            _put(kept, part, name, kept.pop(key))
+    said: dict[str, dict[str, int]] = {}
+    for key, (part, *forms) in _ONE_BY_ONE.items():
+        owner = kept.get(key.split(".")[0], {}) if "." in key else kept
+        name = key.split(".")[-1]
+        if isinstance(owner, dict) and name in owner:
+            value = owner.pop(name)
+            require(value in forms, f"`config.{key}` must be one of {forms}; got {_short(value)}")
+            said.setdefault(part, {})[key] = forms.index(value)
+    for part, choices in said.items():
+        require(
+            len(set(choices.values())) == 1,
+            f"`config.{part}` must follow the paper or the release; got some of both, (0 = paper): {choices}",
+        )
+        design = ("paper", "release")[next(iter(choices.values()))]
+        _put(kept, part, "layer" if part == "decoder" else "design", design)
+    if "crop" not in kept and _is_of_ours(kept):
+        kept["crop"] = {"ratio": _SYNTHETIC_CROP}
     return kept
+
+
+def _put(values: dict[str, Any], part: str, name: str, value: Any) -> None:
+    """Set a key of a part; what is no object is left for the decoder to refuse."""
+    owner = values.setdefault(part, {})
+    if isinstance(owner, dict):
+        owner[name] = value
+
+
+def _is_of_ours(values: dict[str, Any]) -> bool:
+    """Tell a model like `tiny`, which only synthetic captures trained, by its trunk."""
+    trunk = values.get("backbone")
+    return isinstance(trunk, dict) and trunk.get("stem") == "space_to_depth"
 
 
 def _encode(value: Any, declared: Any) -> Any:

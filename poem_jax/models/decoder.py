@@ -1,8 +1,7 @@
 """Point-embedded Transformer decoder: query points read the basis points and move.
 
-Paper, section "Point-Embedded Transformer Decoder"; the released decoder by named choices of `DecoderConfig`.
-
-Coordinates are in units of the basis radius, about the root.
+Paper, section "Point-Embedded Transformer Decoder". The layer of the paper and that of the release are two
+classes with one signature. Coordinates are in units of the basis radius, about the root.
 """
 
 import functools
@@ -13,30 +12,18 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.hand.topology import NUM_QUERIES
-from poem_jax.models.config import (
-    AttentionKeys,
-    CoordinateUpdate,
-    DecoderConfig,
-    DecoderOutput,
-    NeighbourSearch,
-    VectorForm,
-)
+from poem_jax.models.config import DecoderConfig, DecoderOutput, Design, NeighbourSearch
 from poem_jax.models.layers import dropout, layer_norm, linear, normal
 from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
     Neighbours,
     VectorAttention,
-    anchored,
     nearest_neighbours,
 )
-from poem_jax.typing import Array, Float, Int, PRNGKeyArray
+from poem_jax.typing import Array, Float, PRNGKeyArray
 
-
-class Anchors(NamedTuple):
-    """Rows that all queries read in the first layer, and the positions that count for them."""
-
-    index: Int[Array, " k"]
-    positions: Float[Array, "k 3"]
+_PAPER_EPSILON, RELEASE_EPSILON = 1e-5, 1e-12
+"""Of the layer norms."""
 
 
 class Surroundings(NamedTuple):
@@ -45,12 +32,6 @@ class Surroundings(NamedTuple):
     basis: Neighbours
     queries: Neighbours | None
     """None where queries do not read each other."""
-
-
-def around_anchors(anchors: Anchors) -> Surroundings:
-    """Let all queries of all samples read the same anchors, of queries and basis alike (batch 1)."""
-    everywhere = anchored(anchors.index, anchors.positions)
-    return Surroundings(everywhere, everywhere)
 
 
 def shared(surroundings: Surroundings, batch_size: int) -> Surroundings:
@@ -70,11 +51,10 @@ class Decoder(nnx.Module):
     def __init__(self, config: DecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.config = config
         self.embeddings = nnx.Param(normal(rngs.params(), (NUM_QUERIES, width)))
-        # The last layer regresses offsets or parameters, never both.
-        kinds = [DecoderOutput.OFFSETS] * (config.num_layers - 1) + [config.output]
+        layer = ReleaseLayer if config.layer is Design.RELEASE else PaperLayer
         self.layers = nnx.List(
-            DecoderLayer(config, width, output=kind, is_last=i == config.num_layers - 1, rngs=rngs)
-            for i, kind in enumerate(kinds)
+            layer(config, width, is_last=i == config.num_layers - 1, rngs=rngs)
+            for i in range(config.num_layers)
         )
         self.locate = CoordinateEmbedding(width, rngs=rngs) if config.embed_coordinates else None
 
@@ -106,53 +86,59 @@ class Decoder(nnx.Module):
             moved.append(queries)
         return moved[: len(moved) - (self.config.output is DecoderOutput.HAND_PARAMETERS)], embeddings
 
-    def with_first_deltas(self, queries: Float[Array, "1 query 3"], first: Surroundings) -> Surroundings:
-        """Compute beforehand what the first layer needs of queries and neighbours that never move."""
-        vector = self.layers[0].vector_attention
-        if isinstance(vector, VectorAttention):
-            return first._replace(basis=vector.with_deltas(queries, first.basis))
-        assert first.queries is not None
-        return Surroundings(
-            vector.basis.attention.with_deltas(queries, first.basis),
-            vector.queries.attention.with_deltas(queries, first.queries),
-        )
-
     def _surroundings(self, queries: Array, points: Array) -> Surroundings:
         k = self.config.num_neighbours
         shared = jnp.broadcast_to(points, (queries.shape[0], *points.shape))
-        among = self.config.vector_form is VectorForm.QUERIES_THEN_BASIS
+        among = self.config.layer is Design.RELEASE
         return Surroundings(
             nearest_neighbours(queries, shared, k),
             nearest_neighbours(queries, queries, k) if among else None,
         )
 
 
-class DecoderLayer(nnx.Module):
-    """Two scalar attentions, vector attention, and what moves the points."""
+class PaperLayer(nnx.Module):
+    """Queries read each other, the basis points, and their nearest basis points; then they move."""
 
-    def __init__(
-        self, config: DecoderConfig, width: int, *, output: DecoderOutput, is_last: bool, rngs: nnx.Rngs
-    ) -> None:
-        self.config = config
-        self.embed = linear(width, width, rngs=rngs) if config.shared_embedding else None
-        self.self_attention, self.cross_attention = (
-            MultiHeadAttention(width, config.num_heads, dropout_rate=config.dropout, rngs=rngs)
-            for _ in range(2)
-        )
-        basis_alone = config.vector_form is VectorForm.BASIS
-        self.vector_attention = (VectorAttention if basis_alone else QueriesThenBasis)(width, rngs=rngs)
-        self.norms = nnx.List(
-            layer_norm(width, config.layer_norm_epsilon, rngs=rngs) for _ in range(3 if basis_alone else 2)
-        )
-        moves, hidden = output is DecoderOutput.OFFSETS, config.ffn_expansion * width
-        if config.coordinate_update is CoordinateUpdate.FEED_FORWARD:
-            self.branch = None
-            self.feed_forward = OffsetNetwork(width, hidden, rngs=rngs) if moves else None
-        else:
-            self.branch = OffsetNetwork(width, width, rngs=rngs) if moves else None
-            # After the last offsets nobody reads the embeddings.
-            unread = is_last and moves
-            self.feed_forward = None if unread else ResidualNetwork(config, width, hidden, rngs=rngs)
+    def __init__(self, config: DecoderConfig, width: int, *, is_last: bool, rngs: nnx.Rngs) -> None:
+        self.basis_stride = config.cross_attention_basis_stride
+        self.self_attention, self.cross_attention = _scalar_attentions(config, width, rngs)
+        self.vector_attention = VectorAttention(width, rngs=rngs)
+        self.norms = nnx.List(layer_norm(width, _PAPER_EPSILON, rngs=rngs) for _ in range(3))
+        moves = _moves(config, is_last)
+        self.feed_forward = OffsetNetwork(width, config.ffn_expansion * width, rngs=rngs) if moves else None
+
+    def __call__(
+        self,
+        embeddings: Float[Array, "batch query c"],
+        queries: Float[Array, "batch query 3"],
+        features: Float[Array, "batch basis c"],
+        surroundings: Surroundings,
+        dropout_key: PRNGKeyArray | None = None,
+    ) -> tuple[Float[Array, "batch query c"], Float[Array, "batch query 3"]]:
+        """Return the updated embeddings and points."""
+        after_queries, after_basis, after_nearest = self.norms
+        keys = [None] * 2 if dropout_key is None else list(jax.random.split(dropout_key, 2))
+        e = after_queries(embeddings + self.self_attention(embeddings, embeddings, keys[0]))
+        e = after_basis(e + self.cross_attention(e, features[:, :: self.basis_stride], keys[1]))
+        e = after_nearest(e + self.vector_attention(e, queries, features, surroundings.basis))
+        return e, queries if self.feed_forward is None else queries + self.feed_forward(e)
+
+
+class ReleaseLayer(nnx.Module):
+    """Queries read the basis points twice, near queries, and near basis points; they move, then comes the
+    feed-forward network."""
+
+    def __init__(self, config: DecoderConfig, width: int, *, is_last: bool, rngs: nnx.Rngs) -> None:
+        self.basis_stride, self.dropout_rate = config.cross_attention_basis_stride, config.dropout
+        self.embed = linear(width, width, rngs=rngs)
+        self.self_attention, self.cross_attention = _scalar_attentions(config, width, rngs)
+        self.vector_attention = QueriesThenBasis(width, rngs=rngs)
+        self.norms = nnx.List(layer_norm(width, RELEASE_EPSILON, rngs=rngs) for _ in range(2))
+        moves = _moves(config, is_last)
+        self.branch = OffsetNetwork(width, width, rngs=rngs) if moves else None
+        # After the last offsets nobody reads the embeddings.
+        unread = is_last and moves
+        self.feed_forward = None if unread else ResidualNetwork(config, width, rngs=rngs)
 
     def __call__(
         self,
@@ -164,32 +150,39 @@ class DecoderLayer(nnx.Module):
     ) -> tuple[Float[Array, "batch query c"], Float[Array, "batch query 3"]]:
         """Return the updated embeddings and points."""
         keys = [None] * 5 if dropout_key is None else list(jax.random.split(dropout_key, 5))
-        after_first, after_second = self.norms[0], self.norms[1]
-        e, tokens = self._embedded(embeddings, features, keys[:2])
-        basis = tokens[:, :: self.config.cross_attention_basis_stride]
-        read_first = e if self.config.first_attention is AttentionKeys.QUERIES else basis
-        e = after_first(e + self.self_attention(e, read_first, keys[2]))
+        after_first, after_second = self.norms
+        e = dropout(self.embed(embeddings), self.dropout_rate, keys[0])
+        tokens = dropout(self.embed(features), self.dropout_rate, keys[1])
+        basis = tokens[:, :: self.basis_stride]
+        e = after_first(e + self.self_attention(e, basis, keys[2]))
         e = after_second(e + self.cross_attention(e, basis, keys[3]))
-        e = self._read_points(e, queries, tokens, surroundings)
-        return self._moved(e, queries, keys[4])
-
-    def _embedded(self, embeddings: Array, features: Array, keys: list) -> tuple[Array, Array]:
-        if self.embed is None:
-            return embeddings, features
-        rate = self.config.dropout
-        return dropout(self.embed(embeddings), rate, keys[0]), dropout(self.embed(features), rate, keys[1])
-
-    def _read_points(self, e: Array, queries: Array, features: Array, surroundings: Surroundings) -> Array:
-        if isinstance(self.vector_attention, QueriesThenBasis):
-            return self.vector_attention(e, queries, features, surroundings)
-        return self.norms[2](e + self.vector_attention(e, queries, features, surroundings.basis))
-
-    def _moved(self, e: Array, queries: Array, key: PRNGKeyArray | None) -> tuple[Array, Array]:
-        if isinstance(self.feed_forward, OffsetNetwork):
-            return e, queries + self.feed_forward(e)
+        e = self.vector_attention(e, queries, tokens, surroundings)
         if self.branch is not None:
             queries = queries + self.branch(e)
-        return e if self.feed_forward is None else self.feed_forward(e, key), queries
+        return e if self.feed_forward is None else self.feed_forward(e, keys[4]), queries
+
+    def with_deltas(self, queries: Float[Array, "1 query 3"], surroundings: Surroundings) -> Surroundings:
+        """Compute beforehand what this layer needs of queries and neighbours that never move."""
+        vector, near = self.vector_attention, surroundings
+        assert near.queries is not None
+        return Surroundings(
+            vector.basis.attention.with_deltas(queries, near.basis),
+            vector.queries.attention.with_deltas(queries, near.queries),
+        )
+
+
+def _scalar_attentions(
+    config: DecoderConfig, width: int, rngs: nnx.Rngs
+) -> tuple["MultiHeadAttention", "MultiHeadAttention"]:
+    first, second = (
+        MultiHeadAttention(width, config.num_heads, dropout_rate=config.dropout, rngs=rngs) for _ in range(2)
+    )
+    return first, second
+
+
+def _moves(config: DecoderConfig, is_last: bool) -> bool:
+    """Whether a layer regresses offsets; the last regresses these or parameters, never both."""
+    return not is_last or config.output is DecoderOutput.OFFSETS
 
 
 class QueriesThenBasis(nnx.Module):
@@ -226,10 +219,10 @@ class OffsetNetwork(nnx.Module):
 class ResidualNetwork(nnx.Module):
     """Feed-forward network of the embeddings: LayerNorm(e + W_2 gelu(W_1 e)), with the exact (erf) GELU."""
 
-    def __init__(self, config: DecoderConfig, width: int, hidden: int, *, rngs: nnx.Rngs) -> None:
-        self.dropout_rate = config.dropout
+    def __init__(self, config: DecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
+        self.dropout_rate, hidden = config.dropout, config.ffn_expansion * width
         self.hidden, self.out = linear(width, hidden, rngs=rngs), linear(hidden, width, rngs=rngs)
-        self.norm = layer_norm(width, config.layer_norm_epsilon, rngs=rngs)
+        self.norm = layer_norm(width, RELEASE_EPSILON, rngs=rngs)
 
     def __call__(
         self, embeddings: Float[Array, "batch query c"], dropout_key: PRNGKeyArray | None = None

@@ -26,7 +26,6 @@ from poem_jax.hand.topology import (
     join_queries,
     split_queries,
 )
-from poem_jax.models.config import Layout
 from poem_jax.models.layers import linear
 from poem_jax.typing import Array, Bool, Float
 
@@ -124,8 +123,9 @@ class HandParameters(NamedTuple):
 class ParameterRegressor(nnx.Module):
     """Learned pooling over the queries, then one linear layer to 16 6D rotations and 10 coefficients."""
 
-    def __init__(self, width: int, layout: Layout = Layout.BY_NAME, *, rngs: nnx.Rngs) -> None:
-        self.layout = layout
+    def __init__(self, width: int, *, row_major: bool = False, rngs: nnx.Rngs) -> None:
+        """`row_major`: (query, channel) in memory is read as (channel, query), as the release does."""
+        self.row_major = row_major
         self.pool = linear(NUM_QUERIES, 1, rngs=rngs)
         numbers = NUM_SKELETON_JOINTS * len(_IDENTITY_6D) + NUM_SHAPES
         self.regress = linear(width, numbers, rngs=rngs)
@@ -137,10 +137,10 @@ class ParameterRegressor(nnx.Module):
 
     def __call__(self, embeddings: Float[Array, "batch query c"]) -> HandParameters:
         """Regress the parameters."""
-        if self.layout is Layout.BY_NAME:
-            channels = jnp.swapaxes(embeddings, -1, -2)
-        else:
+        if self.row_major:
             channels = embeddings.reshape(embeddings.shape[0], embeddings.shape[-1], NUM_QUERIES)
+        else:
+            channels = jnp.swapaxes(embeddings, -1, -2)
         numbers = self.regress(self.pool(channels)[..., 0])
         sixd, shape = jnp.split(numbers, [NUM_SKELETON_JOINTS * len(_IDENTITY_6D)], -1)
         return HandParameters(

@@ -9,7 +9,7 @@ from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.sampling import soft_argmax
 from poem_jax.geometry.triangulation import triangulate
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT
-from poem_jax.models.config import HeatActivation, HRNetConfig, ResNetConfig, RootConfig, ViewWeights
+from poem_jax.models.config import Design, HeatActivation, HRNetConfig, ResNetConfig, RootConfig, ViewWeights
 from poem_jax.models.layers import Conv, NormMode, TopDownBranch, max_pool
 from poem_jax.typing import Array, Bool, Float
 
@@ -22,9 +22,8 @@ _MIN_VARIANCE = 0.25
 class HeatMapBranch(nnx.Module):
     """Heat maps of the joints and their expectation in pixels."""
 
-    def __init__(
-        self, config: RootConfig, trunk: HRNetConfig | ResNetConfig, *, bias: bool = False, rngs: nnx.Rngs
-    ) -> None:
+    def __init__(self, config: RootConfig, trunk: HRNetConfig | ResNetConfig, *, rngs: nnx.Rngs) -> None:
+        bias = config.design is Design.RELEASE
         self.stride, self.cell_offset = config.stride, config.cell_offset
         self.pooling, self.sum_epsilon = config.pooling, config.sum_epsilon
         self.branch = TopDownBranch(trunk.channels, trunk.strides, config.branch_stride, bias=bias, rngs=rngs)
@@ -65,7 +64,12 @@ def triangulate_joints(
         weights = 1 / jnp.maximum(heat_variance(heat_maps), _MIN_VARIANCE)
     mask = jnp.broadcast_to(cams.view_mask[..., None], keypoints_px.shape[:-1])
     joints, solved = triangulate(
-        keypoints_px, cams.K, cams.T_cam_from_world, weights, mask, normalise_rows=config.unit_rows
+        keypoints_px,
+        cams.K,
+        cams.T_cam_from_world,
+        weights,
+        mask,
+        normalise_rows=config.design is Design.PAPER,
     )
     _, depth = project(cams.K, cams.T_cam_from_world, joints[:, None])
     return joints, solved & jnp.all((depth > 0) | ~mask, 1)

@@ -20,16 +20,8 @@ from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import join_queries
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import HRNet, ResNet
-from poem_jax.models.config import (
-    Config,
-    DecoderOutput,
-    FirstNeighbours,
-    HRNetConfig,
-    Layout,
-    PositionCode,
-    QueryStart,
-)
-from poem_jax.models.decoder import Anchors, Decoder, Surroundings, around_anchors
+from poem_jax.models.config import Config, DecoderOutput, Design, HRNetConfig, QueryStart
+from poem_jax.models.decoder import Decoder, Surroundings
 from poem_jax.models.hand_output import (
     ParameterRegressor,
     first_queries,
@@ -45,6 +37,7 @@ from poem_jax.models.point_features import (
     sine_code,
     valid_views_first,
 )
+from poem_jax.models.vector_attention import Neighbours
 from poem_jax.models.world_frame import (
     Reconstruction,
     WorkingFrame,
@@ -94,7 +87,7 @@ class ViewFeatures(NamedTuple):
     keypoints_px: Float[Array, "*batch joint 2"]
     heat_maps: Float[Array, "*batch joint h w"]
     feature_maps: Float[Array, "*batch h w c"]
-    """Without the position code of `PositionCode.VIEW_ROW_COLUMN`, which depends on the other views."""
+    """Without the release's position code, which depends on the other views."""
 
 
 class HandConstants(nnx.Module):
@@ -120,9 +113,10 @@ class AnchorConstants(nnx.Module):
         self.index = Constant(index)
         self.positions = Constant(np.asarray(template[index] / config.basis.radius, np.float32))
 
-    def values(self) -> Anchors:
-        """Return them."""
-        return Anchors(self.index[...], self.positions[...])
+    def surroundings(self) -> Surroundings:
+        """Let all queries of all samples (batch 1) read these rows, of queries and basis alike."""
+        near = Neighbours(*(jnp.asarray(leaf[...])[:, None, None] for leaf in (self.index, self.positions)))
+        return Surroundings(near, near)
 
 
 class Poem(nnx.Module):
@@ -132,19 +126,19 @@ class Poem(nnx.Module):
         self.config = config
         trunk = config.backbone
         self.trunk = (HRNet if isinstance(trunk, HRNetConfig) else ResNet)(trunk, rngs=rngs)  # pyright: ignore[reportArgumentType]
-        self.heat_maps = HeatMapBranch(config.root, trunk, bias=config.branch_bias, rngs=rngs)
+        self.heat_maps = HeatMapBranch(config.root, trunk, rngs=rngs)
         self.features = FeatureBranch(config, rngs=rngs)
         self.aggregation = ProjectiveAggregation(config.aggregation, config.width, rngs=rngs)
         self.decoder = Decoder(config.decoder, config.width, rngs=rngs)
         parametric = config.decoder.output is DecoderOutput.HAND_PARAMETERS
+        is_release = config.decoder.layer is Design.RELEASE
         self.regressor = (
-            ParameterRegressor(config.width, config.decoder.pooling, rngs=rngs) if parametric else None
+            ParameterRegressor(config.width, row_major=is_release, rngs=rngs) if parametric else None
         )
         self.basis_points = Constant(jnp.asarray(basis_points(config.basis)))
         template = template_queries(hand, config.decoder.query_order)
         self.template_queries = Constant(jnp.asarray(template))
-        anchored = config.decoder.first_neighbours is FirstNeighbours.ANCHORS
-        self.anchors = AnchorConstants(config, template) if anchored else None
+        self.anchors = AnchorConstants(config, template) if is_release else None
         self.hand = HandConstants(hand)
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
@@ -196,7 +190,7 @@ class Poem(nnx.Module):
 
     def first_surroundings(self) -> Surroundings | None:
         """Return whom the first decoder layer reads (batch 1), None where that depends on the sample."""
-        return None if self.anchors is None else around_anchors(self.anchors.values())
+        return None if self.anchors is None else self.anchors.surroundings()
 
     def prepared_surroundings(self) -> Surroundings | None:
         """Return the same with all that is constant in it computed."""
@@ -204,7 +198,7 @@ class Poem(nnx.Module):
         if first is None or self.config.decoder.query_start is not QueryStart.TEMPLATE:
             return first
         start = self.template_queries[...] / self.config.basis.radius
-        return self.decoder.with_first_deltas(start[None], first)
+        return self.decoder.layers[0].with_deltas(start[None], first)
 
     def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
         scale = 255.0 if views.dtype == jnp.uint8 else 1.0
@@ -215,14 +209,15 @@ class Poem(nnx.Module):
         self, feature_maps: Float[Array, "batch view h w c"], cams: Cameras, root: Float[Array, "batch 3"]
     ) -> Float[Array, "batch basis c"]:
         """Return the features of the basis points about `root`, fused over the views."""
+        by_paper = self.config.features.design is Design.PAPER
         feature_maps = self.features.with_position(feature_maps, cams.view_mask)
-        if self.config.aggregation.layout is Layout.ROW_MAJOR:
+        if self.config.aggregation.design is Design.RELEASE:
             feature_maps, cams = valid_views_first(feature_maps, cams)
         basis = root[:, None] + self.basis_points[...]
         sampled, uv_share = projected_features(
-            feature_maps, cams, basis, self.config.image_hw, self.config.basis.behind_camera
+            feature_maps, cams, basis, self.config.image_hw, zeros_behind=by_paper
         )
-        if self.config.features.position_code is PositionCode.PROJECTED_POINT:
+        if by_paper:
             sampled = sampled + sine_code(uv_share, sampled.shape[-1])
         return self.aggregation(sampled, cams.view_mask, primary_view(cams.view_mask))
 

@@ -11,14 +11,7 @@ from flax import nnx
 
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.sampling import sample_bilinear
-from poem_jax.models.config import (
-    BasisConfig,
-    BasisSampling,
-    BehindCamera,
-    Config,
-    FeatureFusion,
-    PositionCode,
-)
+from poem_jax.models.config import BasisConfig, BasisSampling, Config, Design
 from poem_jax.models.layers import Conv, ConvNorm, NormMode, TopDownBranch, double_bilinear
 from poem_jax.typing import Array, Bool, Float
 
@@ -31,14 +24,14 @@ class FeatureBranch(nnx.Module):
     """Image features for the basis points, on a map of `config.features.stride`."""
 
     def __init__(self, config: Config, *, rngs: nnx.Rngs) -> None:
-        trunk, bias, features = config.backbone, config.branch_bias, config.features
-        if features.fusion is FeatureFusion.TOP_DOWN:
-            self.branch = TopDownBranch(trunk.channels, trunk.strides, features.stride, bias=bias, rngs=rngs)
+        trunk, features = config.backbone, config.features
+        is_release = features.design is Design.RELEASE
+        if is_release:
+            self.branch = BottomUpBranch(trunk.channels, bias=True, rngs=rngs)
         else:
-            self.branch = BottomUpBranch(trunk.channels, bias=bias, rngs=rngs)
+            self.branch = TopDownBranch(trunk.channels, trunk.strides, features.stride, rngs=rngs)
         self.project = Conv(self.branch.c_out, config.width, 1, bias=True, rngs=rngs)
-        on_map = features.position_code is PositionCode.VIEW_ROW_COLUMN
-        self.position = ViewRowColumnCode(config.width, rngs=rngs) if on_map else None
+        self.position = ViewRowColumnCode(config.width, rngs=rngs) if is_release else None
 
     def __call__(self, levels: tuple[Array, ...], mode: NormMode) -> Float[Array, "image h w c"]:
         """Return the feature maps."""
@@ -93,20 +86,21 @@ def projected_features(
     cams: Cameras,
     points_world: Float[Array, "batch basis 3"],
     image_hw: tuple[int, int],
-    behind: BehindCamera = BehindCamera.ZEROS,
+    *,
+    zeros_behind: bool = True,
 ) -> tuple[Float[Array, "batch view basis c"], Float[Array, "batch view basis 2"]]:
     """Sample every view's features where the points project (paper, eq. 5).
 
     Points that project outside the image sample zeros.
 
     Returns: the features, and the projections as shares (u / W, v / H) of the image; zero for points behind
-    the camera, unless `behind` takes these as they are.
+    the camera, unless `zeros_behind` is False: these sample where they project through its centre.
     """
     uv_px, depth = project(cams.K, cams.T_cam_from_world, points_world[:, None])
     uv_share = uv_px / jnp.array(image_hw[::-1], uv_px.dtype)
     cells_wh = jnp.array(feature_maps.shape[-3:-1][::-1], uv_px.dtype)
     sampled = sample_bilinear(feature_maps, uv_share * cells_wh)
-    if behind is BehindCamera.MIRRORED:
+    if not zeros_behind:
         return sampled, uv_share
     seen = (depth > 0)[..., None]
     return jnp.where(seen, sampled, 0), jnp.where(seen, uv_share, 0)

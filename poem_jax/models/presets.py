@@ -7,30 +7,23 @@ ours, for a CPU.
 
 from dataclasses import replace
 
-from poem_jax.hand.topology import NUM_JOINTS, QueryOrder
+from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.models.config import (
     AggregationConfig,
-    AttentionKeys,
     BasisConfig,
-    BehindCamera,
     Config,
-    CoordinateUpdate,
+    CropConfig,
     DecoderConfig,
     DecoderOutput,
+    Design,
     FeatureConfig,
-    FeatureFusion,
-    FirstNeighbours,
     HeatActivation,
-    Layout,
     NeighbourSearch,
-    PositionCode,
     QueryStart,
     ResNetConfig,
     RootConfig,
     Similarity,
-    SingleView,
     Stem,
-    VectorForm,
     ViewWeights,
 )
 
@@ -40,24 +33,10 @@ V2_LARGE = replace(V2_BASE, width=512)
 V2_PARAM = replace(V2_BASE, decoder=DecoderConfig(output=DecoderOutput.HAND_PARAMETERS))
 
 V2_MEDIUM_RELEASE = Config(
-    branch_bias=True,
-    root=RootConfig(num_joints=NUM_JOINTS, pooling=2, cell_offset=0.0, sum_epsilon=1e-6, unit_rows=False),
-    features=FeatureConfig(
-        stride=16, fusion=FeatureFusion.BOTTOM_UP, position_code=PositionCode.VIEW_ROW_COLUMN
-    ),
-    basis=BasisConfig(behind_camera=BehindCamera.MIRRORED),
-    aggregation=AggregationConfig(layout=Layout.ROW_MAJOR, single_view=SingleView.RESIDUAL, narrow_phi=True),
-    decoder=DecoderConfig(
-        query_order=QueryOrder.JOINTS_FIRST,
-        first_attention=AttentionKeys.BASIS,
-        vector_form=VectorForm.QUERIES_THEN_BASIS,
-        first_neighbours=FirstNeighbours.ANCHORS,
-        coordinate_update=CoordinateUpdate.BRANCH_BEFORE,
-        shared_embedding=True,
-        layer_norm_epsilon=1e-12,
-        dropout=0.1,
-        pooling=Layout.ROW_MAJOR,
-    ),
+    root=RootConfig(num_joints=NUM_JOINTS, design=Design.RELEASE),
+    features=FeatureConfig(stride=16, design=Design.RELEASE),
+    aggregation=AggregationConfig(design=Design.RELEASE),
+    decoder=DecoderConfig(layer=Design.RELEASE, dropout=0.1),
 )
 V2_SMALL_RELEASE = replace(V2_MEDIUM_RELEASE, width=128)
 V2_LARGE_RELEASE = replace(V2_MEDIUM_RELEASE, width=512)
@@ -68,6 +47,7 @@ V2_MEDIUM_MANO_RELEASE = replace(
 
 TINY = Config(
     image_hw=(128, 128),
+    crop=CropConfig(ratio=1.5),
     width=64,
     backbone=ResNetConfig(
         blocks=(1, 2, 3, 2),

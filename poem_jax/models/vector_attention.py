@@ -49,11 +49,6 @@ def nearest_neighbours(
     return Neighbours(index, jax.vmap(_rows, (None, 0))(points, index))
 
 
-def anchored(index: Int[Array, " k"], positions: Float[Array, "k 3"]) -> Neighbours:
-    """Let every query read the same rows, which count as standing at `positions` (batch 1)."""
-    return Neighbours(jnp.asarray(index)[:, None, None], jnp.asarray(positions)[:, None, None])
-
-
 class _Sums(NamedTuple):
     """Of the neighbours visited so far, relative to exp(largest)."""
 

@@ -1,6 +1,6 @@
 """Names of the released POEM-v2 models: the arrays that matter, and those that no output depends on.
 
-FACTS section 9. `live_entries` and `dead_shapes` together are the whole state dict, but for the buffers that
+`live_entries` and `dead_shapes` together are the whole state dict, but for the buffers that
 hold the MANO asset (`hand_prefixes`).
 """
 

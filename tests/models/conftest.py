@@ -15,7 +15,7 @@ from poem_jax.models.config import (
     AggregationConfig,
     Config,
     DecoderOutput,
-    FirstNeighbours,
+    Design,
     HRNetConfig,
     QueryStart,
     RootConfig,
@@ -58,7 +58,7 @@ def constants(config: Config) -> dict:
         "template_queries": template,
         "hand": hand._asdict(),
     }
-    if config.decoder.first_neighbours is FirstNeighbours.ANCHORS:
+    if config.decoder.layer is Design.RELEASE:
         index = farthest_points(template, config.decoder.num_neighbours)
         made["anchors"] = {"index": index, "positions": template[index] / np.float32(config.basis.radius)}
     return made

@@ -4,7 +4,7 @@ import pytest
 from flax import nnx
 
 from poem_jax.models.aggregation import ProjectiveAggregation, row_major_tokens
-from poem_jax.models.config import AggregationConfig, Layout, Similarity, SingleView
+from poem_jax.models.config import AggregationConfig, Design, Similarity
 
 BATCH, VIEWS, POINTS, WIDTH = 3, 4, 5, 8
 FEATURES = np.random.default_rng(0).normal(size=(BATCH, VIEWS, POINTS, WIDTH)).astype(np.float32)
@@ -77,17 +77,19 @@ def test_row_major_tokens_read_the_memory_of_the_valid_views():
 
 
 def test_one_view_gets_the_residual_of_the_release():
-    config = AggregationConfig(single_view=SingleView.RESIDUAL, narrow_phi=True)
+    config = AggregationConfig(design=Design.RELEASE)
     module = ProjectiveAggregation(config, WIDTH, rngs=nnx.Rngs(0))
     assert module.phi_in.kernel.shape == (WIDTH // 2, WIDTH // 2)
-    f1 = FEATURES[2, 2]
+    alone = FEATURES[2:, 2:3]
+    f1 = np.asarray(row_major_tokens(jnp.asarray(alone), np.ones(1, int)))[0, 0]
     theta = module.theta_out(np.maximum(module.theta_in(f1), 0))
     expected = f1 + module.phi_out(np.maximum(module.phi_in(theta), 0))
-    np.testing.assert_allclose(module(FEATURES, MASK, PRIMARY)[2], expected, atol=1e-6)
+    found = module(alone, np.ones((1, 1), bool), np.zeros(1, int))
+    np.testing.assert_allclose(found[0], expected, atol=1e-6)
 
 
 def test_masked_views_do_not_matter_to_the_row_major_layout():
-    config = AggregationConfig(layout=Layout.ROW_MAJOR, single_view=SingleView.RESIDUAL)
+    config = AggregationConfig(design=Design.RELEASE)
     module = ProjectiveAggregation(config, WIDTH, rngs=nnx.Rngs(0))
     mask = np.array([[True] * 4, [True, True, False, False], [True, False, False, False]])
     found = module(FEATURES, mask, np.zeros(3, int))

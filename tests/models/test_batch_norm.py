@@ -55,3 +55,10 @@ def test_moments_over_devices_equal_those_of_the_whole(images):
     for part, expected in zip(parts, whole, strict=True):
         np.testing.assert_allclose(part[0], expected, rtol=1e-5)
         np.testing.assert_allclose(part[1], expected, rtol=1e-5)
+
+
+def test_a_small_variance_beside_a_large_mean_keeps_its_digits():
+    images = np.random.default_rng(0).normal(1000.0, 0.1, (5, 4, 6, 3)).astype(np.float32)
+    _, variance, _ = masked_moments(jnp.asarray(images), jnp.asarray(MASK))
+    exact = images[MASK].reshape(-1, 3).astype(np.float64).var(0)
+    np.testing.assert_allclose(variance, exact, rtol=1e-3)

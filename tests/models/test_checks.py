@@ -1,5 +1,6 @@
 """Bad input: every message says what, expected, got."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.models.apply import apply, check_inputs
+from poem_jax.models.infer import infer, prepare
 from poem_jax.models.network import check_params
 
 
@@ -117,3 +119,32 @@ def test_params_of_another_config(micro_config, make_params, make_scene):
         apply(make_params(micro_config), *make_scene(2, 3), config=replace(micro_config, width=32))
     with pytest.raises(ValueError, match=message):
         check_params(micro_config, {"trainable": {}})
+
+
+@pytest.fixture(params=["apply", "infer"])
+def eager(request, micro_config, make_params):
+    params = make_params(micro_config)
+    if request.param == "apply":
+        return functools.partial(apply, params, config=micro_config)
+    return functools.partial(infer, prepare(params, micro_config))
+
+
+def test_one_camera_given_several_times_does_not_fix_the_hand(eager, make_scene):
+    """The second sample is good."""
+    views, cams = make_scene(2, 3)
+    T = cams.T_cam_from_world.copy()
+    T[0, 1:] = T[0, 0]
+    with pytest.raises(ValueError, match=r"cameras at one place .* in samples \[0\] .*or `root_world`"):
+        eager(views, cams._replace(T_cam_from_world=T))
+
+
+def test_parallel_rays_do_not_fix_the_hand(eager, make_scene):
+    """The same image seen by the same camera, moved sideways."""
+    views, cams = make_scene(2, 3)
+    K, T, views = cams.K.copy(), cams.T_cam_from_world.copy(), views.copy()
+    views[0], K[0], T[0] = views[0, 0], K[0, 0], T[0, 0]
+    T[0, :, 0, 3] += [0.0, 0.1, -0.1]
+    with pytest.raises(ValueError, match=r"different directions .* samples \[0\] all rays .* are parallel"):
+        eager(views, cams._replace(K=K, T_cam_from_world=T))
+    root = np.array([[0.0, 0.0, 0.0], [np.nan] * 3], np.float32)
+    assert eager(views, cams._replace(K=K, T_cam_from_world=T), root_world=root).valid.all()

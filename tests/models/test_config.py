@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -51,11 +52,33 @@ def test_unknown_choice_fails():
         from_json(json.dumps(text))
 
 
-def test_configs_of_earlier_versions_are_read():
-    text = json.loads(to_json(preset("tiny")))
+EARLIER = json.loads((Path(__file__).parent / "configs_of_earlier_versions.json").read_text())
+
+
+@pytest.mark.parametrize("name", sorted(EARLIER))
+def test_configs_of_earlier_versions_are_read(name):
+    """Before parts named their design, every choice was a field; the crops were not told."""
+    assert from_json(json.dumps(EARLIER[name])) == preset(name)
+
+
+def test_configs_of_the_first_version_are_read():
+    text = json.loads(json.dumps(EARLIER["tiny"]))
     text["similarity"] = text.pop("aggregation")["similarity"]
     text["feature_stride"] = text.pop("features")["stride"]
+    del text["root"]["sum_epsilon"]
     assert from_json(json.dumps(text)) == preset("tiny")
+
+
+def test_an_earlier_config_that_mixes_designs_is_refused():
+    text = json.loads(json.dumps(EARLIER["v2-medium-release"]))
+    text["decoder"]["first_attention"] = "queries"
+    with pytest.raises(ValueError, match=r"`config.decoder` must follow the paper or the release"):
+        from_json(json.dumps(text))
+
+
+def test_models_tell_the_crops_that_they_were_trained_on():
+    ratios = {name: preset(name).crop.ratio for name in PRESETS}
+    assert ratios == {name: 1.5 if name == "tiny" else 2.0 for name in PRESETS}
 
 
 @pytest.mark.parametrize(

@@ -6,24 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from poem_jax.hand.topology import NUM_QUERIES, QueryOrder
+from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models import infer as inference
 from poem_jax.models.apply import apply
-from poem_jax.models.config import (
-    AggregationConfig,
-    AttentionKeys,
-    BehindCamera,
-    CoordinateUpdate,
-    DecoderOutput,
-    FeatureConfig,
-    FeatureFusion,
-    FirstNeighbours,
-    Layout,
-    PositionCode,
-    RootConfig,
-    SingleView,
-    VectorForm,
-)
+from poem_jax.models.config import AggregationConfig, DecoderOutput, Design, FeatureConfig, RootConfig
 from poem_jax.models.infer import infer, prepare
 
 METRES = 2e-5
@@ -34,28 +20,11 @@ def like_release(micro, output=DecoderOutput.OFFSETS):
     """All choices of the released models on a small one; every point a neighbour, so that no tie matters."""
     return replace(
         micro,
-        branch_bias=True,
-        root=RootConfig(num_joints=21, pooling=2, cell_offset=0.0, unit_rows=False),
-        features=FeatureConfig(
-            stride=4, fusion=FeatureFusion.BOTTOM_UP, position_code=PositionCode.VIEW_ROW_COLUMN
-        ),
-        basis=replace(micro.basis, num_points=NUM_QUERIES, behind_camera=BehindCamera.MIRRORED),
-        aggregation=AggregationConfig(
-            layout=Layout.ROW_MAJOR, single_view=SingleView.RESIDUAL, narrow_phi=True
-        ),
-        decoder=replace(
-            micro.decoder,
-            num_neighbours=NUM_QUERIES,
-            query_order=QueryOrder.JOINTS_FIRST,
-            first_attention=AttentionKeys.BASIS,
-            vector_form=VectorForm.QUERIES_THEN_BASIS,
-            first_neighbours=FirstNeighbours.ANCHORS,
-            coordinate_update=CoordinateUpdate.BRANCH_BEFORE,
-            shared_embedding=True,
-            layer_norm_epsilon=1e-12,
-            pooling=Layout.ROW_MAJOR,
-            output=output,
-        ),
+        root=RootConfig(num_joints=21, design=Design.RELEASE),
+        features=FeatureConfig(stride=4, design=Design.RELEASE),
+        basis=replace(micro.basis, num_points=NUM_QUERIES),
+        aggregation=AggregationConfig(design=Design.RELEASE),
+        decoder=replace(micro.decoder, num_neighbours=NUM_QUERIES, layer=Design.RELEASE, output=output),
     )
 
 

@@ -19,7 +19,7 @@ from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
 from poem_jax.models import apply, infer
-from poem_jax.models.config import BehindCamera, DecoderOutput, FirstNeighbours, ViewWeights
+from poem_jax.models.config import DecoderOutput, Design, ViewWeights
 from poem_jax.models.hand_output import template_queries
 from poem_jax.models.presets import TINY, V2_MEDIUM_RELEASE, preset
 from tests.models import numpy_geometry
@@ -42,7 +42,7 @@ def _complete(params: dict, config) -> dict:
     """Give the weights of a release-like model the constants that go with its choices."""
     template = template_queries(default_hand(), config.decoder.query_order)
     extra = {"template_queries": template}
-    if config.decoder.first_neighbours is FirstNeighbours.ANCHORS:
+    if config.decoder.layer is Design.RELEASE:
         index = farthest_points(template, config.decoder.num_neighbours)
         extra["anchors"] = {"index": index, "positions": template[index] / config.basis.radius}
     return {**params, "constants": {**params["constants"], **extra}}
@@ -133,13 +133,15 @@ def _scene(config, params, keypoints_px, heat_maps, maps, K, T_cam_from_world, r
     if config.root.view_weights is ViewWeights.HEAT_SPREAD:
         spreads = np.array([[numpy_geometry.spread(heat) for heat in view] for view in heat_maps])
         weights = 1 / np.maximum(spreads, numpy_geometry.SHARPEST_MAP)
-    joints, solved = numpy_geometry.lift_all(keypoints_px, K, T, weights, unit_rows=config.root.unit_rows)
+    joints, solved = numpy_geometry.lift_all(
+        keypoints_px, K, T, weights, unit_rows=config.root.design is Design.PAPER
+    )
     index = ROOT_JOINT if len(joints) > 1 else 0
     root = joints[index] if solved[index] else numpy_geometry.FALLBACK_ROOT
     if np.isfinite(root_world).all():
         root = numpy_geometry.move(T_cam_from_world[0], root_world)
     points = root + params["constants"]["basis_points"]
-    zeros_behind = config.basis.behind_camera is BehindCamera.ZEROS
+    zeros_behind = config.features.design is Design.PAPER
     samples = numpy_geometry.sample_views(maps, K, T, points, config.image_hw, zeros_behind=zeros_behind)
     return joints, solved, root, *samples
 

@@ -11,6 +11,7 @@ import pytest
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle, skew_matrix, transform_points
 from poem_jax.hand.model import HandModel, hand_mesh
+from poem_jax.hand.template import default_hand
 from poem_jax.models.apply import _predict, apply, init
 from poem_jax.models.network import describe, forward
 
@@ -294,6 +295,30 @@ def test_gradients_through_apply_match_finite_differences(micro_config, make_par
             found = jnp.sum(getattr(gradient, name) * step)
             np.testing.assert_allclose((plus - minus) / 2, found, rtol=5e-4, err_msg=name)
             np.testing.assert_allclose(alone, getattr(gradient, name), rtol=1e-9)
+
+
+def test_params_have_gradients(parametric_config, make_scene):
+    """Indices and flags are among the parameters of `init`, and not among what is differentiated."""
+    params, scene = init(parametric_config, key=jax.random.key(0)), make_scene(2, 4)
+    gradient = jax.grad(lambda p: apply(p, *scene, config=parametric_config).vertices_world.sum())(params)
+    assert jax.tree.structure(gradient) == jax.tree.structure(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    np.testing.assert_array_equal(gradient["constants"]["hand"]["faces"], default_hand().faces)
+
+
+def test_fresh_weights_have_their_distributions(hrnet_config):
+    params = init(replace(hrnet_config, width=64), key=jax.random.key(0))
+    weights = params["trainable"]
+    conv = weights["features"]["branch"]["merges"]["0"]
+    kernel = np.asarray(conv["conv"]["kernel"])
+    np.testing.assert_allclose(kernel.std(), np.sqrt(2 / np.prod(kernel.shape[:-1])), rtol=0.1)
+    linear = np.asarray(weights["decoder"]["layers"]["0"]["vector_attention"]["alpha"]["kernel"])
+    limit = np.sqrt(6 / sum(linear.shape))
+    np.testing.assert_allclose(linear.std(), limit / np.sqrt(3), rtol=0.05)
+    assert np.abs(linear).max() <= limit
+    assert abs(linear.mean()) < 0.05 * limit
+    other = init(replace(hrnet_config, width=64), key=jax.random.key(1))
+    assert not np.allclose(other["trainable"]["decoder"]["embeddings"], weights["decoder"]["embeddings"])
 
 
 def test_training_moves_statistics_and_every_weight_has_a_gradient(joints_config, make_params, make_scene):

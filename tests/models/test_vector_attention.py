@@ -8,7 +8,6 @@ from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
     Neighbours,
     VectorAttention,
-    anchored,
     nearest_neighbours,
 )
 
@@ -110,7 +109,7 @@ def test_anchors_are_neighbours_of_every_query(module):
         jnp.broadcast_to(index[:, None, None], (3, BATCH, QUERIES)),
         jnp.broadcast_to(places[:, None, None], (3, BATCH, QUERIES, 3)),
     )
-    near = anchored(index, places)
+    near = Neighbours(*(jnp.asarray(leaf)[:, None, None] for leaf in (index, places)))
     near = near._replace(index=jnp.broadcast_to(near.index, (3, BATCH, 1)))
     expected = module(EMBEDDINGS, POSITIONS, FEATURES, everywhere)
     np.testing.assert_allclose(module(EMBEDDINGS, POSITIONS, FEATURES, near), expected, atol=1e-6)

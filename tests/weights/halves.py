@@ -48,7 +48,7 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
     "norms": (nnx.LayerNorm, "__call__", _rows40),
     "vec_self": (vector_attention.BracketedVectorAttention, "among_queries", _rows40),
     "vec_cross": (vector_attention.BracketedVectorAttention, "to_basis", _rows40),
-    "out": (decoder.DecoderLayer, "__call__", lambda args, out: out[0][:, ::40]),
+    "out": (decoder.ReleaseLayer, "__call__", lambda args, out: out[0][:, ::40]),
     "neighbours": (decoder, "nearest_neighbours", lambda args, out: jnp.moveaxis(out.index, 0, -1)),
 }
 """What is kept of every call of a function or method, in the order of the calls."""
