@@ -48,7 +48,8 @@ class _Header(NamedTuple):
 
     @property
     def shown_wh(self) -> tuple[int, int]:
-        return self.size_wh[::-1] if self.orientation >= 5 else self.size_wh
+        width, height = self.size_wh
+        return (height, width) if self.orientation >= 5 else (width, height)
 
 
 def read_image(path: str | os.PathLike, size_wh: tuple[int, int] | None = None) -> UInt8[Array, "h w 3"]:
@@ -190,7 +191,8 @@ def _read_jpeg_header(data: bytes) -> _Header:
         (length,) = struct.unpack_from(">H", data, position + 2)
         content = data[position + 4 : position + 2 + length]
         if marker in _SIZE_MARKERS:
-            size_wh = struct.unpack_from(">HH", content, 1)[::-1]
+            height, width = struct.unpack_from(">HH", content, 1)
+            size_wh = (width, height)
         elif marker == _EXIF_MARKER and content.startswith(_EXIF_START):
             orientation = _orientation(content[len(_EXIF_START) :])
         position += 2 + length

@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from io import BufferedIOBase
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -28,6 +29,8 @@ MAX_ARRAYS = 1000
 MAX_CAUSE = 300
 """Characters of another library's message that are passed on."""
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+BinaryStream = IO[bytes] | BufferedIOBase
+"""A file, or a member of an archive."""
 _KINDS = "biufUS"
 """Truth values, whole numbers, floats and text."""
 _ENDING = ".npy"
@@ -115,7 +118,7 @@ def _array_named(name: str) -> Iterator[None]:
         raise ValueError(f"`{name[:60]}`: {_cause(error)}") from error
 
 
-def _read_array(stream: BufferedIOBase, size: int) -> Array:
+def _read_array(stream: BinaryStream, size: int) -> Array:
     """Read one array in NumPy's format from a stream of `size` bytes."""
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:

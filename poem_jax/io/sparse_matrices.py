@@ -138,8 +138,9 @@ def _by_list(state: dict[str, Any], data: Any, shape: tuple[int, int]) -> _Entri
 def _by_diagonal(state: dict[str, Any], data: Any, shape: tuple[int, int]) -> _Entries:
     """DIA: row k of `data` is the diagonal that begins `offsets[k]` columns to the right, by columns."""
     offsets = state.get("offsets")
-    fits = isinstance(offsets, np.ndarray) and offsets.dtype.kind in "iu" and offsets.ndim == 1
-    if not (fits and isinstance(data, np.ndarray) and data.ndim == 2 and len(data) == len(offsets)):
+    if not isinstance(offsets, np.ndarray) or not isinstance(data, np.ndarray) or data.ndim != 2:
+        raise ValueError("data and offsets must be arrays: the rows of one and a flat list of offsets")
+    if offsets.dtype.kind not in "iu" or offsets.shape != data.shape[:1]:
         raise ValueError("data must be a row of numbers for each of the flat list of offsets")
     data = data[:, : shape[1]]
     columns = np.broadcast_to(np.arange(data.shape[1]), data.shape)
