@@ -6,12 +6,14 @@ from poem_jax.batch import Prediction
 from poem_jax.capture.crop import crop_hands, hand_squares
 from poem_jax.capture.frame import HandCrops, HandResult
 from poem_jax.capture.network import MAX_BATCH, UNDETERMINED, Network, predict_hands
+from poem_jax.capture.pipeline import by_network
 from poem_jax.capture.read import read_images
+from poem_jax.capture.report import Clock
 from poem_jax.capture.take import read_take
 from poem_jax.geometry.cameras import project
 from poem_jax.hand.model import hand_mesh, mirror
 from poem_jax.hand.template import default_hand
-from poem_jax.models.config import Config
+from poem_jax.models.config import Config, CropConfig
 
 HW = (64, 64)
 
@@ -141,3 +143,16 @@ def test_a_group_without_hands_costs_nothing(make_capture):
     (done,) = predict_hands([frame._replace(crops=(nothing,))], take, network(model))
     assert done.hands[0].reason == "seen in 0 view(s); two are needed"
     assert not model.fed
+
+
+def test_crops_are_as_wide_as_the_model_was_trained_with(make_capture):
+    """Twice the ratio sees twice as much: half the focal length, about the same centre."""
+    take = read_take(make_capture().folder)
+    fed = []
+    for ratio in (1.0, 2.0):
+        model = Recorder(lambda views, cams: {"valid": np.zeros(len(views), bool)})
+        wide = Network(Config(image_hw=HW, crop=CropConfig(ratio)), None, "stub", model)
+        list(by_network(take.frames, take, Clock(), wide))
+        fed.append(model.fed[0][1].K[0])
+    np.testing.assert_allclose(fed[0][:, 0, 0], 2 * fed[1][:, 0, 0], rtol=1e-5)
+    np.testing.assert_allclose(fed[0][:, :2, 2] - 32, 2 * (fed[1][:, :2, 2] - 32), atol=1e-3)
