@@ -17,7 +17,7 @@ MAKE_KEYPOINTS = """
 import shutil
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.demo import demo_folder, ground_truth
-from poem_jax.capture.folder import read_rig
+from poem_jax.calibration.rig_json import read_rig
 from poem_jax.geometry.cameras import project
 
 rig = read_rig(demo_folder() / "rig.json")

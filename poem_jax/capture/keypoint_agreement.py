@@ -27,8 +27,8 @@ PALM_M = (0.04, 0.16)
 """From the wrist to the middle knuckle, metres: no hand is outside."""
 ADULT_PALM_M = 0.093
 
-_LEAST_GAIN = 5.0
-_MOST_FRAMES = 0.75
+_MIN_GAIN = 5.0
+_MIN_SHARE_OF_FRAMES = 0.75
 """The mirror image must be likelier by e^5 in the median frame, and likelier at all in three of four."""
 _FITS_NOT = 4.0
 
@@ -98,7 +98,7 @@ def judge_fit(name: str, own: "FitResult", other: "FitResult", noise: "KeypointN
         ]
     gain = own.cost - other.cost
     gain = gain[np.isfinite(gain)]
-    if gain.size and np.median(gain) > _LEAST_GAIN and (gain > 0).mean() >= _MOST_FRAMES:
+    if gain.size and np.median(gain) > _MIN_GAIN and (gain > 0).mean() >= _MIN_SHARE_OF_FRAMES:
         return [
             f"hand '{name}' seems to be of the other side: its mirror image is likelier by a factor of "
             f"e^{np.median(gain):.0f} a frame (median), as its joints bend the natural way; check `hand_side`"

@@ -14,7 +14,7 @@ from poem_jax.io.safe_pickle import StandIn
 from poem_jax.io.sparse_matrices import dense_matrix, is_sparse_matrix, whole_numbers
 
 _DEEPEST_SELECTION = 8
-_MOST_DIMENSIONS = 8
+_MAX_DIMENSIONS = 8
 
 
 def as_array(value: Any, depth: int = 0) -> np.ndarray | None:
@@ -52,6 +52,6 @@ def _chumpy_value(value: StandIn, depth: int) -> np.ndarray | None:
 
 def _checked_shape(shape: Any, name: str, size: int) -> tuple[int, ...]:
     sizes = tuple(whole_numbers(shape, name, below=size + 1).tolist())
-    if len(sizes) > _MOST_DIMENSIONS or math.prod(sizes) != size:
-        raise ValueError(f"{name} must arrange {size} values; got {sizes[:_MOST_DIMENSIONS]}")
+    if len(sizes) > _MAX_DIMENSIONS or math.prod(sizes) != size:
+        raise ValueError(f"{name} must arrange {size} values; got {sizes[:_MAX_DIMENSIONS]}")
     return sizes

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import as_strided
 _CODES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 _OBJECT_CODES = ("O8", "O4")
 _ORDERS = ("<", ">", "|")
-_MOST_DIMENSIONS = 32
+_MAX_DIMENSIONS = 32
 _LARGEST_BYTES = 2**40
 
 
@@ -244,7 +244,7 @@ def _is_plain_state(state: tuple) -> bool:
 
 
 def _is_sizes(sizes: Any) -> bool:
-    whole = isinstance(sizes, tuple) and len(sizes) <= _MOST_DIMENSIONS
+    whole = isinstance(sizes, tuple) and len(sizes) <= _MAX_DIMENSIONS
     return whole and all(type(n) is int and 0 <= n <= _LARGEST_BYTES for n in sizes)
 
 

@@ -37,7 +37,7 @@ _GIVEN = {
     pickle.OBJ: slice(None),
 }
 """Where that lies which an operation hands to a callable, which may copy it."""
-_MOST_GIVEN, _GIVEN_BESIDES = 4, 2**16
+_MAX_GIVEN, _GIVEN_BESIDES = 4, 2**16
 """In all, callables may be given this many items for each byte of the pickle, and this many."""
 
 
@@ -181,7 +181,7 @@ class _Reader(pickle._Unpickler):
         """A short pickle could hand one long list to many calls, and fill the memory with copies."""
         parts = (part for value in values if isinstance(value, tuple) for part in value)
         self._given += sum(len(part) for part in (*values, *parts) if isinstance(part, _SIZED))
-        if self._given > _MOST_GIVEN * (self._stream.tell() - self._start) + _GIVEN_BESIDES:
+        if self._given > _MAX_GIVEN * (self._stream.tell() - self._start) + _GIVEN_BESIDES:
             raise ValueError("it uses the same contents again and again")
 
     def get_extension(self, code: int) -> Any:

@@ -26,9 +26,9 @@ from poem_jax.io.torch_pickle import DTYPES, describe, make_storage
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001
 _USUAL_NAMES = ("state_dict", "model_state_dict", "model", "net", "network")
-_MOST_GROWTH, _MOST_BESIDES = 16, 2**26
+_MAX_GROWTH, _MAX_BESIDES = 16, 2**26
 """The arrays may take this many times the file's size, and this many bytes: tensors may share storages."""
-_MOST_CAUSE = 300
+_MAX_CAUSE = 300
 """Characters of zipfile's message, which quotes what stands in the place of a name, that are passed on."""
 _ZIP_PROBLEMS = (
     zipfile.BadZipFile,
@@ -70,7 +70,7 @@ def load_state_dict(path: str | Path) -> dict[str, np.ndarray]:
         file = form(stream, str(path))
         stored = _find_state_dict(file.described, str(path))
         total = sum(value.nbytes for value in stored.values())
-        if total > _MOST_GROWTH * size + _MOST_BESIDES:
+        if total > _MAX_GROWTH * size + _MAX_BESIDES:
             raise ValueError(f"the arrays of {path} would take {total} bytes, far more than its {size}")
         return _read_arrays(stored, file)
 
@@ -169,7 +169,7 @@ class _ZipForm:
         except _ZIP_PROBLEMS as error:
             raise ValueError(
                 f"{self._source} must be a whole zip archive of torch.save; reading it stopped with "
-                f"{type(error).__name__}: {str(error)[:_MOST_CAUSE]}. Is the file cut short or damaged? "
+                f"{type(error).__name__}: {str(error)[:_MAX_CAUSE]}. Is the file cut short or damaged? "
                 "Fetch it again."
             ) from error
 
