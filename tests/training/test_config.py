@@ -39,6 +39,13 @@ def test_every_experiment_builds(name):
     assert sum(leaf.size for leaf in jax.tree.leaves(state.params["trainable"])) > 1e6
 
 
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_a_model_says_what_crops_it_is_trained_on(name):
+    config = open_experiment(name)
+    assert config.model.crop.ratio == config.data.synthetic.crop.expand_ratio
+    assert not config.model.crop.upright
+
+
 def abstract_batch(config: TrainConfig) -> MultiViewBatch:
     """Shapes of the experiment's largest batch."""
     kind = max(config.data.batches, key=lambda shape: shape.num_views)
