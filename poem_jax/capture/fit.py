@@ -123,11 +123,12 @@ def _windows(frames: Iterable[Frame], context: int) -> Iterator[tuple[list[Frame
 
 def _observed(group: list[Frame]) -> tuple[Array, Array]:
     """Return the key points of a group as given (frame, hand, view, 21, 2), and their confidence."""
-    if any(frame.keypoints_px is None for frame in group):
+    given = [frame.keypoints_px for frame in group if frame.keypoints_px is not None]
+    if len(given) < len(group):
         raise ValueError(
             "a fit needs 2D key points; this capture has boxes only: give `keypoints_px`, or use the network"
         )
-    keypoints = np.stack([frame.keypoints_px for frame in group])
+    keypoints = np.stack(given)
     even = np.ones(keypoints.shape[1:-1])
     return keypoints, np.stack([even if f.confidence is None else f.confidence for f in group])
 

@@ -83,6 +83,7 @@ def _evidence(frame: Frame, index: int) -> Evidence:
     if frame.keypoints_px is not None:
         return Evidence(frame.keypoints_px[index], _ALL_JOINTS)
     points_px = frame.hands[index].keypoints_px
+    assert points_px is not None, "a hand comes from key points or from heat maps"
     return Evidence(points_px, (ROOT_JOINT,) if points_px.shape[-2] == 1 else _ALL_JOINTS)
 
 

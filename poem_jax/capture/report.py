@@ -89,7 +89,7 @@ class Report:
         )
         if frame.keypoints_px is None:
             self._against = "the model's own heat maps"
-        self._errors += [hand.reprojection_px.astype(np.float32) for hand in solved]
+        self._errors += [np.asarray(hand.reprojection_px, np.float32) for hand in solved]
         self._views_used += sum(int(hand.view_mask.sum()) for hand in frame.hands)
         self._keep_reasons(frame)
         new = [warning for warning in frame.warnings if warning not in self.warnings]

@@ -126,7 +126,7 @@ class _Writer:
         self._take, self._out, self._style = take, out, style
         self._prediction = GrowingNpz(out / PREDICTION)
         self._names: list[str] = []
-        self._unknown = set(_WHERE_KNOWN)
+        self._unknown: set[str] = set(_WHERE_KNOWN)
         self._animation = AnimatedGlb(
             out / ANIMATION,
             {name: style.faces[side] for name, side in self._hands()},
