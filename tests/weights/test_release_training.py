@@ -3,12 +3,12 @@
 All noise is off: the root is the true joint 9 and nothing is dropped. `eval_modules` normalises by the
 running statistics, `train_modules` by those of the batch.
 
-With running statistics our run is in float64, its neighbours those of the stored run: in float32 single
-gradients at the image end of the trunk differ by half a percent of their norm, by as much between programs
-of our own. Batch statistics make float32 worse: our own float32 and float64 runs then differ by 5e-5 m in
-block 0 (else 1e-6 m) and in a quarter of the final points by more than 2e-5 m, for many neighbours change.
-The stored float32 run is as far from our float64 run, so that its 3D losses and gradients are compared to
-some percent.
+Our runs are in float64. With running statistics their neighbours are those of the stored float32 run, and
+losses agree to 1e-4, gradient norms to 1e-3. With batch statistics they find their own: many neighbours are
+then others, for rounding moves the points of block 0 by 5e-5 m (else by 1e-6 m). Measured, the stored run is
+off by 1.5e-4 in the losses and by 2.7e-2 in the norms (the median by 0.7e-2); our own float32 run is off from
+our float64 run by 1e-3 and 0.1 (the median by 4e-2). So it is float32, and not the network, that sets the
+tolerances there.
 """
 
 import functools
@@ -39,7 +39,6 @@ from tests.weights.procedural import (
     REFERENCE,
     batch_of,
     golden,
-    in_float32,
     manifest,
     needs_reference,
     released,
@@ -85,17 +84,15 @@ def resolved() -> Run:
 
 @functools.cache
 def step(train: bool) -> Step:
-    """Run one setting; with running statistics in float64, and the neighbours are those of `resolved`."""
+    """Run one setting in float64; with running statistics, the neighbours are those of `resolved`."""
     config, params = released("small")
-    batch = in_float32(batch_of("G"))
-    neighbours = () if train else resolved().index
-    with pytest.MonkeyPatch.context() as patch, jax.enable_x64(not train):
+    neighbours = iter(() if train else resolved().index)
+    params, batch = (jax.tree.map(in_float64, tree) for tree in (params, batch_of("G")))
+    with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
         # In a loop, the gradients of convolutions are very slow on a CPU.
         patch.setattr(Stack, "__call__", Stack.unrolled)
         if not train:
-            params, batch = (jax.tree.map(in_float64, tree) for tree in (params, batch_of("G")))
-            searches = iter(neighbours)
-            patch.setattr(vector_attention, "nearest", lambda queries, points, k: next(searches))
+            patch.setattr(vector_attention, "nearest", lambda queries, points, k: next(neighbours))
         run = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames=("config", "train"))
         (total, aux), gradients = run(params["trainable"], params, batch, config=config, train=train)
     terms, prediction, statistics = jax.tree.map(np.asarray, aux)
@@ -229,13 +226,13 @@ def check_true_joints(key: str) -> None:
 def check_losses_of_batch_statistics(key: str) -> None:
     ours, theirs = step(train=True).losses, stored()[key]
     assert ours.keys() == theirs.keys()
-    close(ours["loss_heatmap_joints"], theirs["loss_heatmap_joints"], rtol=1e-5)
+    close(ours["loss_heatmap_joints"], theirs["loss_heatmap_joints"], rtol=1e-6)
     for name in theirs:
-        close(ours[name], theirs[name], rtol=2e-2)
+        close(ours[name], theirs[name], rtol=3e-4)
 
 
 def check_norms_of_batch_statistics(key: str) -> None:
-    compare_norms(step(train=True).gradients, stored()[key], rtol=0.1)
+    compare_norms(step(train=True).gradients, stored()[key], rtol=4e-2)
 
 
 def check_points_of_batch_statistics(key: str) -> None:
