@@ -133,7 +133,9 @@ def test_bracketed_attention_maps_before_and_after():
 def test_the_release_scales_its_logits():
     """Dividing the logits by the root of the width equals scaling gamma's last layer; its bias is idle."""
     scaled = VectorAttention(WIDTH, like_release=True, rngs=nnx.Rngs(2))
-    plain = VectorAttention(WIDTH, rngs=nnx.Rngs(2))
+    plain = VectorAttention(WIDTH, rngs=nnx.Rngs(3))
+    for name in ("alpha", "beta", "psi", "gamma_in", "gamma_out", "xi_in", "xi_out"):
+        getattr(plain, name).kernel[...] = getattr(scaled, name).kernel[...]
     plain.gamma_out.kernel[...] /= np.sqrt(WIDTH)
     scaled.gamma_out.bias[...] += 3.0
     arguments = (EMBEDDINGS, POSITIONS, FEATURES, _of(NEIGHBOURS))

@@ -59,8 +59,8 @@ def listening() -> Iterator[dict[str, list]]:
     heard: dict[str, list] = defaultdict(list)
 
     def with_ear(name: str, function: Callable, pick: Callable) -> Callable:
-        def call(*args: Any) -> Any:
-            out = function(*args)
+        def call(*args: Any, **options: Any) -> Any:
+            out = function(*args, **options)
             heard[name].append(pick(args, out))
             return out
 
