@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, anchor_to_primary, fill_masked_views
-from poem_jax.geometry.transforms import axis_angle_from_rotation, invert_rigid, matmul, rotate_points
+from poem_jax.geometry.transforms import axis_angle_from_rotation, invert_rigid, matmul, rigid, rotate_points
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import NUM_JOINTS, WRIST, QueryOrder, split_queries
 from poem_jax.models.hand_output import HandParameters
@@ -80,20 +80,25 @@ def enter_working_frame(
     )
     finite = finite & finite_per_view(K) & finite_per_view(T_cam_from_world)
     K, T_cam_from_world, shown = fill_masked_views(Cameras(K, T_cam_from_world, mask & finite))
-    T_cam_from_primary, T_primary_from_world = anchor_to_primary(T_cam_from_world, shown)
-    T_world_from_primary = invert_rigid(T_primary_from_world)
-    centre = T_world_from_primary[:, :3, 3]
+    _, T_primary_from_world = anchor_to_primary(T_cam_from_world, shown)
+    centre = invert_rigid(T_primary_from_world)[:, :3, 3]
     if not traced and dtype != np.float64:
         _check_distance(centre)
+    # First to a world about the primary camera: at a kilometre a rotation that float32 rounded, and that is
+    # then no exact one, would move the points.
+    T_cam_from_near = _with_origin_at(T_cam_from_world, centre)
+    T_cam_from_primary, T_primary_from_near = anchor_to_primary(T_cam_from_near, shown)
+    T_near_from_primary = invert_rigid(T_primary_from_near)
+    near_root = None if root_world is None else array_namespace(centre).asarray(root_world) - centre
     coarse = centre.astype(dtype)
     moved = Cameras(K.astype(dtype), T_cam_from_primary.astype(dtype), shown)
     return WorkingFrame(
         moved,
-        _root_in_primary(root_world, T_primary_from_world).astype(dtype),
+        _root_in_primary(near_root, T_primary_from_near).astype(dtype),
         (finite | ~mask).all(-1),
-        T_world_from_primary[:, :3, :3].astype(dtype),
+        T_near_from_primary[:, :3, :3].astype(dtype),
         coarse,
-        (centre - coarse).astype(dtype),
+        (centre - coarse + T_near_from_primary[:, :3, 3]).astype(dtype),
     )
 
 
@@ -137,6 +142,15 @@ def finite_per_view(values: Num[Array, "batch view *rest"]) -> Bool[Array, "batc
     if values.dtype == np.uint8:
         return np.ones(values.shape[:2], bool)
     return array_namespace(values).isfinite(values).all(tuple(range(2, values.ndim)))
+
+
+def _with_origin_at(
+    T_cam_from_world: Float[Array, "batch view 4 4"], centre: Float[Array, "batch 3"]
+) -> Float[Array, "batch view 4 4"]:
+    """Express extrinsics in worlds with their origins at `centre`; the axes stay."""
+    R = T_cam_from_world[..., :3, :3]
+    offset = rotate_points(R, centre[:, None, None])[..., 0, :]
+    return rigid(R, T_cam_from_world[..., :3, 3] + offset)
 
 
 def _root_in_primary(

@@ -13,7 +13,7 @@ from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle, skew_m
 from poem_jax.hand.model import HandModel, hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.models.apply import _predict, apply, init
-from poem_jax.models.network import describe, forward
+from poem_jax.models.network import describe, forward, leaves_with_names
 
 CONFIGS = ("micro_config", "joints_config", "parametric_config")
 METRES = 2e-5
@@ -351,8 +351,11 @@ def test_inference_leaves_statistics_alone(micro_config, make_params, make_scene
 
 def test_fresh_params_start_at_the_template(micro_config, make_scene):
     params = init(micro_config, key=jax.random.key(0))
-    shapes = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), params)
-    assert shapes == jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), describe(micro_config))
+    shapes, expected = (
+        {name: (leaf.shape, leaf.dtype) for name, leaf in leaves_with_names(tree).items()}
+        for tree in (params, describe(micro_config))
+    )
+    assert shapes == expected
     prediction = apply(params, *make_scene(2, 4), config=micro_config)
     lengths = np.linalg.norm(prediction.vertices_world - prediction.root_world[:, None], axis=-1)
     template = np.linalg.norm(params["constants"]["template_queries"][:778], axis=-1)
