@@ -85,7 +85,7 @@ def _of_today(values: dict[str, Any]) -> dict[str, Any]:
         )
         design = ("paper", "release")[next(iter(choices.values()))]
         _put(kept, part, "layer" if part == "decoder" else "design", design)
-    if "crop" not in kept and _is_of_ours(kept):
+    if "crop" not in kept and not _is_released(kept):
         kept["crop"] = {"ratio": _SYNTHETIC_CROP}
     return kept
 
@@ -97,10 +97,11 @@ def _put(values: dict[str, Any], part: str, name: str, value: Any) -> None:
         owner[name] = value
 
 
-def _is_of_ours(values: dict[str, Any]) -> bool:
-    """Tell a model like `tiny`, which only synthetic captures trained, by its trunk."""
-    trunk = values.get("backbone")
-    return isinstance(trunk, dict) and trunk.get("stem") == "space_to_depth"
+def _is_released(values: dict[str, Any]) -> bool:
+    """Tell a released model by its decoder; all others, when folders did not tell their crops, had been
+    trained on synthetic captures."""
+    decoder = values.get("decoder")
+    return isinstance(decoder, dict) and decoder.get("layer") == "release"
 
 
 def _encode(value: Any, declared: Any) -> Any:

@@ -115,7 +115,8 @@ class AnchorConstants(nnx.Module):
 
     def surroundings(self) -> Surroundings:
         """Let all queries of all samples (batch 1) read these rows, of queries and basis alike."""
-        near = Neighbours(*(jnp.asarray(leaf[...])[:, None, None] for leaf in (self.index, self.positions)))
+        index, positions = (jnp.asarray(leaf[...])[:, None, None] for leaf in (self.index, self.positions))
+        near = Neighbours(index, positions)
         return Surroundings(near, near)
 
 
@@ -198,7 +199,7 @@ class Poem(nnx.Module):
         if first is None or self.config.decoder.query_start is not QueryStart.TEMPLATE:
             return first
         start = self.template_queries[...] / self.config.basis.radius
-        return self.decoder.layers[0].with_deltas(start[None], first)
+        return self.decoder.layers[0].with_deltas(start[None], first)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
         scale = 255.0 if views.dtype == jnp.uint8 else 1.0

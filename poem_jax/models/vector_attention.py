@@ -77,7 +77,8 @@ class VectorAttention(nnx.Module):
         neighbours: Neighbours,
     ) -> Float[Array, "batch query c"]:
         """Read the neighbours' features; coordinates in units of the basis radius."""
-        per_query = self.gamma_in(self.alpha(embeddings) + self.xi_out.bias[...])
+        offset = self._offset()
+        per_query = self.gamma_in(self.alpha(embeddings) + offset)
         beta, psi = features @ (self.beta.kernel[...] @ self.gamma_in.kernel[...]), self.psi(features)
         to_logits, delta = self.gamma_out.kernel[...] * self.logit_scale, self._delta()
 
@@ -88,13 +89,18 @@ class VectorAttention(nnx.Module):
             inside = per_query - _rows(beta, neighbour.index) + added
             return jax.nn.relu(inside) @ to_logits, _rows(psi, neighbour.index) + value
 
-        return _softmax_sum(visit, neighbours) + self.xi_out.bias[...]
+        return _softmax_sum(visit, neighbours) + offset
 
     def with_deltas(self, queries: Float[Array, "batch query 3"], neighbours: Neighbours) -> Neighbours:
         """Compute beforehand what depends on nothing but the positions."""
         delta = self._delta()
         deltas = jax.lax.map(lambda positions: delta(queries, positions), neighbours.positions)
         return neighbours._replace(deltas=deltas)
+
+    def _offset(self) -> Float[Array, " c"]:
+        """Return the part of delta that no position changes."""
+        assert self.xi_out.bias is not None
+        return self.xi_out.bias[...]
 
     def _delta(self) -> Callable[[Array, Array], Deltas]:
         """Return the function from queries and the positions of one neighbour each to `Deltas`."""

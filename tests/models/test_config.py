@@ -57,8 +57,12 @@ EARLIER = json.loads((Path(__file__).parent / "configs_of_earlier_versions.json"
 
 @pytest.mark.parametrize("name", sorted(EARLIER))
 def test_configs_of_earlier_versions_are_read(name):
-    """Before parts named their design, every choice was a field; the crops were not told."""
-    assert from_json(json.dumps(EARLIER[name])) == preset(name)
+    """Before parts named their design, every choice was a field; the crops were not told.
+
+    Those who trained a model of the paper then had nothing but synthetic captures, cut at 1.5.
+    """
+    crop = preset(name).crop if name.endswith("release") else preset("tiny").crop
+    assert from_json(json.dumps(EARLIER[name])) == replace(preset(name), crop=crop)
 
 
 def test_configs_of_the_first_version_are_read():
