@@ -26,12 +26,14 @@ class Detect:
 
         from poem_jax.capture.boxes_file import write_boxes
         from poem_jax.capture.detect import detect_hands
-        from poem_jax.capture.folder import find_frames, find_rig
-        from poem_jax.io.writable import check_file_is_writable
+        from poem_jax.capture.folder import RIG_FILES, find_frames, find_rig
+        from poem_jax.io.writable import check_file_is_writable, check_inputs_stay
 
         check_file_is_writable(self.out)
         rig = find_rig(self.folder, self.rig)
         frames = find_frames(self.folder, rig.names)
+        images = [image for frame in frames for image in frame.images]
+        check_inputs_stay([self.out], [self.rig, *(self.folder / name for name in RIG_FILES), *images])
         say(f"looking for hands in {len(frames)} frames of {rig.num_views} cameras")
         with tells_what_is_left(self.out):
             hands = detect_hands(frames, rig, when_stopped=partial(write_boxes, self.out))

@@ -42,9 +42,11 @@ class Fit:
         """Write the results and print where they are."""
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_keypoint_take
-        from poem_jax.io.writable import check_folder_is_writable
+        from poem_jax.capture.write import take_files
+        from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
         check_folder_is_writable(self.out)
+        check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
         take = read_keypoint_take(self.keypoints, self.rig, self.images)
         hand = hand_from(self.mano)
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")

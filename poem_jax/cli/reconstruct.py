@@ -41,13 +41,15 @@ class Reconstruct:
 
     def run(self) -> None:
         """Write the results and print where they are."""
-        from poem_jax.io.writable import check_folder_is_writable
+        from poem_jax.capture.write import take_files
+        from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
         if self.engine == "fit" and self.checkpoint is not None:
             raise ValueError("--checkpoint is for --engine network; a fit has no weights")
         if self.engine == "network" and (self.mano is not None or self.smooth):
             raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
         check_folder_is_writable(self.out)
+        check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
         with tells_what_is_left(self.out):
             written = self._fit() if self.engine == "fit" else self._reconstruct()
         print_files(written, self.out)

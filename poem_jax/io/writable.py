@@ -3,7 +3,7 @@
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 
@@ -43,6 +43,28 @@ def check_file_is_writable(file: str | os.PathLike, option: str = "--out") -> No
                 file.unlink()
     except OSError as error:
         raise ValueError(f"cannot write the file {file}: {error.strerror}; give another {option}") from error
+
+
+def check_inputs_stay(
+    written: Iterable[str | os.PathLike], read: Iterable[str | os.PathLike | None], option: str = "--out"
+) -> None:
+    """Insist that no file that is to be written is one that is read.
+
+    Args:
+        written: Files that will be made or replaced.
+        read: The user's files; None = not given.
+        option: What chooses where to write.
+
+    Raises:
+        ValueError: One is, under this name or another.
+    """
+    inputs = [Path(path) for path in read if path is not None and _exists(Path(path))]
+    for result in (Path(path) for path in written):
+        for path in inputs:
+            if _exists(result) and result.samefile(path):
+                raise ValueError(
+                    f"{result} would be replaced by a result, and is read; give another {option}"
+                )
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ import pytest
 
 from poem_jax.capture.detect import SIDES, Detection, detect_hands, one_of_each_side
 from poem_jax.capture.folder import FramePaths
+from poem_jax.cli import main
 from poem_jax.geometry.rig import Rig
 
 
@@ -123,3 +124,12 @@ def test_without_mediapipe_the_message_says_how_to_get_it(capture, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"poem-jax\[detect\]"):
         detect_hands(frames, rig)
+
+
+@pytest.mark.parametrize("name", ["rig.json", "front.png"])
+def test_key_points_do_not_replace_what_they_are_found_in(make_capture, capsys, name):
+    folder = make_capture().folder
+    before = (folder / name).read_bytes()
+    assert main(["detect", str(folder), "--out", str(folder / name)]) == 2
+    assert f"{name} would be replaced by a result, and is read; give another --out" in capsys.readouterr().err
+    assert (folder / name).read_bytes() == before

@@ -2,7 +2,7 @@
 
 import pytest
 
-from poem_jax.io.writable import check_file_is_writable, check_folder_is_writable
+from poem_jax.io.writable import check_file_is_writable, check_folder_is_writable, check_inputs_stay
 
 
 def test_good_places_pass_and_stay_as_they_were(tmp_path):
@@ -45,3 +45,12 @@ def test_names_that_no_file_system_takes(tmp_path, check):
 def test_a_file_system_that_takes_no_files(check):
     with pytest.raises(ValueError, match="give another --out"):
         check("/proc/poem_jax")
+
+
+def test_files_that_are_read_are_not_replaced(tmp_path):
+    out, rig = tmp_path / "out", tmp_path / "rig.json"
+    rig.write_text("mine")
+    check_inputs_stay([out / "report.json", tmp_path / "new.npz"], [rig, None, tmp_path / "missing"])
+    out.symlink_to(tmp_path)
+    with pytest.raises(ValueError, match=r"rig\.json would be replaced .* is read; give another --to"):
+        check_inputs_stay([out / "rig.json"], [None, rig], "--to")
