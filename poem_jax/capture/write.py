@@ -50,6 +50,11 @@ _WHERE_KNOWN = ("pose", "shape", "translation", "joint_sigma_m")
 _log = logging.getLogger(__name__)
 
 
+def take_files(out: Path) -> list[Path]:
+    """Return the files that belong to a take as a whole."""
+    return [out / name for name in (PREDICTION, REPORT, PAGE, ANIMATION)]
+
+
 class Written(NamedTuple):
     """What a reconstruction gave; the rest is on disk."""
 
@@ -99,6 +104,7 @@ def write_results(
         FileNotFoundError, ValueError: No hand came out of the whole take; why.
     """
     safe_file_names(take.rig.names, "names of cameras")
+    _check_names_are_free(out)
     writer = _Writer(take, out, style)
     try:
         for frame in frames:
@@ -115,6 +121,15 @@ def write_results(
     finally:
         writer.close()
     return Written(out, writer.files)
+
+
+def _check_names_are_free(out: Path) -> None:
+    """Raise ValueError where a folder has the name of a file of the results."""
+    for path in take_files(out):
+        if path.is_dir():
+            raise ValueError(
+                f"{path} is a folder, and a file of the results has this name: give another --out"
+            )
 
 
 class _Writer:
@@ -263,6 +278,8 @@ def frame_folder(out: Path, name: str) -> Path:
     folder = out / name
     if folder.is_symlink():
         raise ValueError(f"{folder} is a link that leads out of the folder of results: give another --out")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file, and the folder of a frame has this name: give another --out")
     return folder
 
 

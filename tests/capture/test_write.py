@@ -105,3 +105,19 @@ def test_a_link_that_leads_elsewhere_is_not_followed(tmp_path):
     (tmp_path / "out" / "0000").symlink_to(tmp_path / "mine")
     with pytest.raises(ValueError, match="is a link that leads out of the folder of results"):
         frame_folder(tmp_path / "out", "0000")
+
+
+@pytest.mark.parametrize("name", ["prediction.npz", "report.json", "index.html", "hands.glb"])
+def test_a_folder_with_the_name_of_a_result_is_found_before_the_work(make_capture, tmp_path, run, name):
+    mine = tmp_path / "out" / name / "mine"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("keep")
+    with pytest.raises(ValueError, match=rf"{name} is a folder, and a file of the results has this name"):
+        run(make_capture(), tmp_path / "out")
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [mine]
+
+
+def test_a_file_with_the_name_of_a_frame(tmp_path):
+    (tmp_path / "0003").write_text("keep")
+    with pytest.raises(ValueError, match=r"0003 is a file, and the folder of a frame has this name"):
+        write.frame_folder(tmp_path, "0003")
