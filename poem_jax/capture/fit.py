@@ -2,8 +2,8 @@
 
 A hand is fitted to `FRAMES_TOGETHER` frames at a time (`poem_jax.fitting.take`). Its shape is one for the
 whole take: that of the first frames that show enough of it. What is wrong with the whole take - camera
-matrices, unit, side, order of the joints - is said with the first frames, before anything is written; a frame
-in which a hand cannot be fitted is marked, and stops nothing.
+matrices, unit, side, order of the joints - is said with the first frames that show a hand, before any is
+written; a frame in which a hand cannot be fitted is marked, and stops nothing.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
-from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit
+from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
 from poem_jax.capture.take import Take
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.model import HandModel, mirror
@@ -83,10 +83,11 @@ def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool
     for group, turns in _windows(frames, _CONTEXT if smooth else 0):
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
-        if not checked:
+        if not checked and shows_palms(raw):
             check_triangulation(take.rig, raw)
+            checked = True
         warnings = [] if said else [str(finding) for finding in judge_views(take.rig, raw)]
-        checked, said = True, said or bool(warnings)
+        said = said or bool(warnings)
         fitted = []
         for index, hand in enumerate(fits):
             fitted.append(hand.fit(keypoints[:, index], confidence[:, index], take.rig))

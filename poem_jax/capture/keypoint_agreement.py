@@ -62,6 +62,12 @@ def check_triangulation(rig: Rig, keypoints_px: Float[Array, "frame hand view 21
         )
 
 
+def shows_palms(keypoints_px: Float[Array, "frame hand view 21 2"]) -> bool:
+    """Tell whether two views see the ends of a palm, without which no size can be judged."""
+    twice = np.isfinite(keypoints_px).all(-1).sum(2) >= 2
+    return bool((twice[..., WRIST] & twice[..., ROOT_JOINT]).any())
+
+
 @functools.cache
 def adult_hand_size() -> HandSize:
     """Return the bones of the shipped hand, between key points in OpenPose's order."""

@@ -145,6 +145,18 @@ def test_millimetres_called_metres_are_refused(take, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_wrong_unit_is_refused_where_hands_come_late(take, tmp_path):
+    """The first frames show no hand, by which a rig could be judged."""
+    keypoints = take.frames.hands.keypoints_px
+    nothing = np.full((FRAMES_TOGETHER, *keypoints.shape[1:]), np.nan)
+    T = take.rig.T_cam_from_world.copy()
+    T[:, :3, 3] *= 1000
+    late = with_keypoints(take.rig._replace(T_cam_from_world=T), np.concatenate([nothing, keypoints]))
+    with pytest.raises(ValueError, match=r"not metres.*one unit .* about"):
+        fit(late, tmp_path, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
 def test_inverse_extrinsics_are_refused(take, tmp_path):
     wrong = take.rig._replace(T_cam_from_world=invert_rigid(take.rig.T_cam_from_world))
     with pytest.raises(ValueError, match="inverse"):
@@ -297,6 +309,22 @@ def test_the_users_own_hand(files, fitted, tmp_path, side):
     own = np.load(tmp_path / "out" / "prediction.npz")
     np.testing.assert_allclose(own["vertices_world"], fitted.arrays["vertices_world"], atol=1e-4)
     assert main([*command, str(tmp_path / "missing.pkl")]) == 2
+
+
+@pytest.mark.parametrize("name", ["prediction.npz", "report.json"])
+def test_the_results_do_not_replace_what_they_come_from(files, tmp_path, capsys, name):
+    keypoints, rig, _ = files
+    mine = tmp_path / "out" / name
+    mine.parent.mkdir()
+    content = (keypoints if name == "prediction.npz" else rig).read_bytes()
+    mine.write_bytes(content)
+    given = {"prediction.npz": [mine, "--rig", rig], "report.json": [keypoints, "--rig", mine]}[name]
+    assert main(["fit", *map(str, given), "--out", str(mine.parent)]) == 2
+    assert f"{name} would be replaced by a result, and is read; give another --out" in capsys.readouterr().err
+    assert mine.read_bytes() == content
+    command = ["reconstruct", str(tmp_path), "--rig", str(mine), "--out", str(mine.parent)]
+    assert main(command) == 2
+    assert "would be replaced by a result" in capsys.readouterr().err
 
 
 def test_smoothing_from_the_command_line(files, fitted, tmp_path):
