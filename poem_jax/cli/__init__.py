@@ -1,8 +1,29 @@
 """`poem`, the command line: one file a command, and `run.py`, which reads the arguments and runs one of them.
 
-Arguments are parsed before JAX is imported, so that help is quick and devices can still be chosen.
+Arguments are parsed before JAX is imported, so that help is quick and devices can still be chosen. `run.py`
+and what it needs are imported by `start` alone, so that Ctrl-C ends the program in words meanwhile, too.
 """
 
-from poem_jax.cli.run import USAGE_ERROR, main, start
+import sys
+from collections.abc import Sequence
 
-__all__ = ["USAGE_ERROR", "main", "start"]
+USAGE_ERROR = 2
+STOPPED_BY_SIGINT = 130
+
+
+def start(arguments: Sequence[str] | None = None) -> int:
+    """Run `main` as a program of its own: with the allocator that suits it, and undisturbed by `| head`."""
+    try:
+        from poem_jax.cli.run import start as run
+
+        return run(arguments)
+    except KeyboardInterrupt:
+        print("poem: stopped by SIGINT", file=sys.stderr)
+        return STOPPED_BY_SIGINT
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; see `run.main`."""
+    from poem_jax.cli.run import main as run
+
+    return run(arguments)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from poem_jax.cli import USAGE_ERROR
 from poem_jax.cli.demo import Demo
 from poem_jax.cli.detect import Detect
 from poem_jax.cli.evaluate import Eval
@@ -18,7 +19,6 @@ from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.cli.signals import UntilReaderLeaves, exit_code, stop_on_signals
 from poem_jax.cli.train import Train
 
-USAGE_ERROR = 2
 Command = Demo | Reconstruct | Fit | Detect | Train | Eval | ImportTorch | ExportTorch
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]

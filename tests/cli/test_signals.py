@@ -68,6 +68,21 @@ def test_a_signal_that_comes_while_garbage_is_collected_is_not_lost():
         work()
 
 
+@pytest.mark.parametrize("module", ["tyro", "poem_jax.cli.run"])
+def test_a_signal_that_comes_while_the_program_is_loaded(module):
+    stop_at = (
+        "import builtins, sys\n"
+        "def stop(name, *rest, real=builtins.__import__, **more):\n"
+        f"    if name == {module!r}: raise KeyboardInterrupt\n"
+        "    return real(name, *rest, **more)\n"
+        "builtins.__import__ = stop\n"
+        "from poem_jax.cli import start\n"
+        "sys.exit(start(['--help']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", stop_at], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "poem: stopped by SIGINT\n")
+
+
 def test_the_files_of_an_earlier_run_are_not_what_was_done(tmp_path, capsys):
     old = tmp_path / "prediction.npz"
     old.write_text("")
