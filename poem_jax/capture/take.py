@@ -1,5 +1,6 @@
 """What a capture holds: cameras, hands, and its frames, of which no image is read before its turn."""
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import safe_file_names
 
 BOXES_FILES = ("boxes.npz",)
+
+_log = logging.getLogger(__name__)
 
 
 class Take(NamedTuple):
@@ -109,7 +112,14 @@ def read_keypoint_take(
             f"{keypoints} holds boxes only; a fit needs `keypoints_px (F, H, V, 21, 2)`, OpenPose order"
         )
     pictures = [] if images is None else find_frames(images, found.names)
+    _check_numbers_differ([frame.name for frame in pictures])
     by_key = {frame_key(frame.name): frame for frame in pictures}
+    if hands.frames is None and len(pictures) not in (0, len(hands.boxes_px)):
+        _log.warning(
+            "%s names none of its %d frames, and %s has %d: its images are taken by their numbers from 0000; "
+            "add `frames (F,)` with the frames' names to the file to say which is which",
+            *(keypoints, len(hands.boxes_px), images, len(pictures)),
+        )
     names = hands.frames or _frame_names(len(hands.boxes_px), pictures)
     hands = align_boxes(hands, names, found.names, keypoints)
     nothing = (None,) * found.num_views
@@ -127,9 +137,10 @@ def read_keypoint_take(
 def make_take(rig: Rig, paths: Sequence[FramePaths], hands: HandBoxes) -> Take:
     """Put a take together; boxes that lie wholly outside their image count as unseen.
 
-    Raises: ValueError: The name of a frame cannot be that of a folder, or comes twice.
+    Raises: ValueError: The name of a frame cannot be that of a folder, or comes twice, if only as a number.
     """
-    safe_file_names([frame.name for frame in paths], "names of frames")
+    names = safe_file_names([frame.name for frame in paths], "names of frames")
+    _check_numbers_differ(names)
     return Take(rig, hands.hand_side, StoredFrames(paths, without_boxes_outside(hands, rig.size_wh)))
 
 
@@ -150,6 +161,17 @@ def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(
         side if sides.count(side) == 1 else f"{side}_{sides[:i].count(side)}" for i, side in enumerate(sides)
     )
+
+
+def _check_numbers_differ(names: Iterable[str]) -> None:
+    """Raise ValueError if two names are those of one frame, as '9' and '0009' are."""
+    by_key: dict[str | int, str] = {}
+    for name in names:
+        other = by_key.setdefault(frame_key(name), name)
+        if other != name:
+            raise ValueError(
+                f"frames must have different numbers; {other!r} and {name!r} have one: rename one"
+            )
 
 
 def _frame_names(count: int, pictures: list[FramePaths]) -> tuple[str, ...]:

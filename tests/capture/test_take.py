@@ -2,7 +2,8 @@
 
 import pytest
 
-from poem_jax.capture.take import hand_names, read_take
+from poem_jax.capture.boxes_file import write_boxes
+from poem_jax.capture.take import hand_names, read_keypoint_take, read_take
 
 
 def test_what_is_missing_is_said(make_capture, tmp_path):
@@ -27,3 +28,22 @@ def test_what_is_missing_is_said(make_capture, tmp_path):
 def test_names_of_hands():
     assert hand_names(("right", "left")) == ("right", "left")
     assert hand_names(("right", "left", "right")) == ("right_0", "left", "right_1")
+
+
+def test_two_frames_of_one_number(make_capture):
+    """Boxes are matched by number: those of frame 3 would be taken for both."""
+    capture = make_capture(2)
+    (capture.folder / "frames" / "3").mkdir()
+    with pytest.raises(ValueError, match=r"different numbers; '0?0?0?3' and '0?0?0?3' have one: rename one"):
+        read_take(capture.folder)
+
+
+def test_images_of_frames_without_names_are_said_to_be_taken_by_number(make_capture, caplog):
+    capture = make_capture(3, keypoints=True)
+    two = capture.hands._replace(
+        frames=None, boxes_px=capture.hands.boxes_px[:2], keypoints_px=capture.hands.keypoints_px[:2]
+    )
+    file = write_boxes(capture.folder / "keypoints.npz", two)
+    take = read_keypoint_take(file, images=capture.folder)
+    assert "names none of its 2 frames, and" in caplog.text
+    assert [frame.name for frame in take.frames] == ["0000", "0001"]
