@@ -47,7 +47,8 @@ _COMPONENT_SHAPES = {
 _KNUCKLES = (1, 4, 7, 10)
 """First joints of index, middle, little and ring finger in MANO's order."""
 _SUM_TOLERANCE = 1e-3
-_LONGEST_HAND_M = 1.0
+_EXTENT_M = (0.05, 1.0)
+"""Of any hand in metres."""
 _CLEAR_AGREEMENT = 0.3
 """Beyond this, `_agreement_of_length_and_width` tells: +0.80 for our own hand, -0.80 with the fault, and
 0 +- 0.3 for shape directions of random numbers."""
@@ -229,10 +230,10 @@ def _kind(value: Any) -> str:
 
 def _check_values(arrays: Mapping[str, np.ndarray], tree: Any, source: str) -> None:
     extent = np.ptp(arrays["v_template"].astype(float), axis=0).max()
-    if extent > _LONGEST_HAND_M:
+    if not _EXTENT_M[0] <= extent <= _EXTENT_M[1]:
         raise ValueError(
-            f"`v_template` in {source} must be in metres; got a hand {extent:.0f} long. "
-            "Divide millimetres by 1000."
+            f"`v_template` in {source} must be in metres; got a hand {extent:.3g} long. "
+            "Divide millimetres by 1000, centimetres by 100."
         )
     for name in ("J_regressor", "weights"):
         sums = arrays[name].astype(float).sum(axis=1)

@@ -183,6 +183,8 @@ def test_reads_the_reference_asset(shared_dir: Path):
         ),
         ({"v_template": np.full((778, 3), np.nan)}, "`v_template` .* must be finite"),
         ({"v_template": _fields()["v_template"] * 1000}, "must be in metres.*Divide millimetres by 1000"),
+        ({"v_template": _fields()["v_template"] * 100}, "must be in metres.*centimetres by 100"),
+        ({"v_template": _fields()["v_template"] / 10}, r"must be in metres; got a hand 0\.0\d+ long"),
         ({"weights": np.zeros((778, 16))}, "rows of `weights` .* must sum to 1"),
         ({"f": np.full((1538, 3), 778)}, r"`f` .* vertex numbers 0\.\.777; got 778\.\.778"),
         ({"kintree_table": np.zeros((2, 16), int)}, "`kintree_table` .* must have MANO's parents"),
