@@ -1,6 +1,7 @@
 """The stage `judge`: how well each hand agrees with what the images say, and whether the images agree."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ SINGLE_SHARE, SEVERAL_SHARE = 0.17, 0.12
 of `SEVERAL` hands. Of 104 synthetic captures of 4 views, whose images are right, the shipped weights pass the
 first in 95 %; of those with two images exchanged 17 % pass, with one mirrored 30 %."""
 SEVERAL = 8
+TWINS_M = 0.01
+"""Mean distance of the joints, in metres, below which two hands are one: fingers are thicker than this."""
 _ALL_JOINTS = tuple(range(NUM_JOINTS))
 
 
@@ -37,15 +40,18 @@ def judge_hands(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
         rig: The cameras.
 
     Returns: the stream, its hands with errors in pixels of the photographs; and a warning at the frame where
-        it shows that what a network sees in the views does not fit together.
+        it shows that what a network sees in the views does not fit together, or that two hands are one.
     """
     views = _Views(rig)
+    said_twins = False
     for frame in frames:
         hands = tuple(
             hand if hand.joints_world is None else _measured(hand, _evidence(frame, index), rig)
             for index, hand in enumerate(frame.hands)
         )
-        yield frame._replace(hands=hands, warnings=(*frame.warnings, *views.judge(hands)))
+        twins = () if said_twins else _twins(hands)
+        said_twins = said_twins or bool(twins)
+        yield frame._replace(hands=hands, warnings=(*frame.warnings, *views.judge(hands), *twins))
 
 
 def joints_shown(
@@ -92,6 +98,16 @@ def _measured(hand: HandResult, evidence: Evidence, rig: Rig) -> HandResult:
         reprojection_px=reprojection_error(hand.joints_world, evidence, rig),
         joints_shown=joints_shown(hand.joints_world, hand.view_mask, rig),
     )
+
+
+def _twins(hands: Sequence[HandResult]) -> list[str]:
+    """Return a warning for two hands at one place."""
+    found = [(index, hand.joints_world) for index, hand in enumerate(hands) if hand.joints_world is not None]
+    return [
+        f"hands {a} and {b} lie at one place, {1000 * distance:.0f} mm apart: is one hand given twice?"
+        for (a, joints_a), (b, joints_b) in combinations(found, 2)
+        if (distance := float(np.linalg.norm(joints_a - joints_b, axis=-1).mean())) < TWINS_M
+    ][:1]
 
 
 class _Views:

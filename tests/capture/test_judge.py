@@ -152,3 +152,18 @@ def test_what_is_in_doubt_in_one_hand_is_told_by_several(rig, hands):
     said = warnings_of(rig, off)
     assert said[0] == ()
     assert [bool(warnings) for warnings in said].index(True) == SEVERAL - 1
+
+
+def test_one_hand_given_twice_is_told_once(rig):
+    joints = known_hands()[1][0]
+    mask = np.ones(rig.num_views, bool)
+    nothing = np.full((2, rig.num_views, 4), np.nan)
+    points = np.full((2, rig.num_views, 21, 2), np.nan)
+
+    def frame(name, apart):
+        hands = tuple(HandResult(mask, joints_world=joints + np.array([x, 0, 0])) for x in (0, apart))
+        return Frame(name, nothing, points, hands=hands)
+
+    stream = [frame("0", 0.03), frame("1", 0.004), frame("2", 0.0)]
+    told = [judged.warnings for judged in judge_hands(stream, rig)]
+    assert told == [(), ("hands 0 and 1 lie at one place, 4 mm apart: is one hand given twice?",), ()]
