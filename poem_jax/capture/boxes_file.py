@@ -236,6 +236,13 @@ def _keypoints(content: Mapping[str, Array], num_hands: int, path: Path) -> Arra
     keypoints = np.where(np.isfinite(keypoints).all(-1, keepdims=True), keypoints, np.nan)
     if "confidence" in content:
         trusted = _confidence(content["confidence"], keypoints.shape[:-1], path) >= MIN_CONFIDENCE
+        seen = np.isfinite(keypoints).all(-1)
+        dropped = (seen & ~trusted).sum()
+        if 2 * dropped > seen.sum():
+            _log.warning(
+                "%s: %d of %d key points have a confidence below %g, and count as unseen",
+                *(path, dropped, seen.sum(), MIN_CONFIDENCE),
+            )
         keypoints = np.where(trusted[..., None], keypoints, np.nan)
     lost = np.any([(keypoints == value).all(-1) for value in NOT_FOUND], axis=0)
     if lost.any():

@@ -254,3 +254,12 @@ def test_wrong_files(tmp_path):
     (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match="must be an npz of plain arrays"):
         read_boxes(tmp_path / "half.npz")
+
+
+@pytest.mark.parametrize(("confidence", "told"), [(0.1, True), (0.9, False)])
+def test_low_confidences_that_cost_most_key_points_are_told(tmp_path, caplog, confidence, told):
+    points = np.arange(2 * 3 * 21 * 2.0).reshape(2, 1, 3, 21, 2)
+    weights = np.full(points.shape[:-1], confidence)
+    np.savez(tmp_path / "k.npz", keypoints_px=points, hand_side=["right"], confidence=weights)
+    read_boxes(tmp_path / "k.npz")
+    assert ("of 126 key points have a confidence below 0.2" in caplog.text) == told
