@@ -17,7 +17,7 @@ from poem_jax.calibration.epipolar import (
 )
 from poem_jax.calibration.findings import Finding
 from poem_jax.geometry.rig import Rig
-from poem_jax.typing import Array, Bool, Float
+from poem_jax.typing import Array, Float
 
 SUSPICIOUS_SHARE = 0.006
 """Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
@@ -26,6 +26,10 @@ CAUSES = ("copied images", "flipped image", "cameras exchanged")
 """Names of the findings that say why views disagree, not only that they do."""
 MAX_ORDERED_VIEWS = 5
 """Of so many cameras every order is tried; of more, every exchange of two."""
+MAX_EXCHANGED_VIEWS = 12
+"""Of more views no cause is looked for, as the time grows with the fourth power of their number."""
+_MAX_NAMED = 6
+"""Pairs of cameras in a message."""
 _MAX_POINTS = 2000
 _COPIED_SHARE = 0.1
 """Of a hand's extent in the image: key points of two cameras nearer to each other than this are of one
@@ -66,10 +70,11 @@ def judge_views(
     distances = epipolar_distances_px(rig, ideal)
     if not (distances > limit).any():
         return []
-    copied = _copied(rig, keypoints_px, distances > limit)
+    copied = _copied(rig, keypoints_px, distances, limit)
     if copied:
         return copied
-    fitting = [(cost, finding) for cost, finding in _causes(rig, keypoints_px) if cost <= limit]
+    causes = _causes(rig, keypoints_px) if rig.num_views <= MAX_EXCHANGED_VIEWS else ()
+    fitting = [(cost, finding) for cost, finding in causes if cost <= limit]
     fitting.sort(key=lambda pair: pair[0])
     if fitting and (len(fitting) == 1 or fitting[1][0] > _CLEAR * fitting[0][0]):
         return [fitting[0][1]]
@@ -138,13 +143,16 @@ def _exchanged(rig: Rig, order: tuple[int, ...]) -> Finding:
     )
 
 
-def _copied(rig: Rig, keypoints_px: Array, apart: Bool[Array, "view view"]) -> list[Finding]:
+def _copied(
+    rig: Rig, keypoints_px: Array, distances: Float[Array, "view view"], limit: float
+) -> list[Finding]:
     """Tell views with the same key points, though their cameras stand apart."""
     by_view = np.moveaxis(keypoints_px, 2, 0)
-    limit = max(2.0, _COPIED_SHARE * _extent(keypoints_px))
+    same = max(2.0, _COPIED_SHARE * _extent(keypoints_px))
     for a, b in combinations(range(rig.num_views), 2):
         distance = np.linalg.norm(by_view[a] - by_view[b], axis=-1)
-        if apart[[a, b]].any() and np.isfinite(distance).any() and np.nanmedian(distance) < limit:
+        alike = np.isfinite(distance).any() and np.nanmedian(distance) < same
+        if alike and _one_is_wrong(a, b, distances, limit):
             evidence = (
                 f"cameras '{rig.names[a]}' and '{rig.names[b]}' show the hands at the same pixels "
                 f"({np.nanmedian(distance):.0f} px apart), which cameras at different places do not: "
@@ -152,6 +160,17 @@ def _copied(rig: Rig, keypoints_px: Array, apart: Bool[Array, "view view"]) -> l
             )
             return [Finding("copied images", evidence, "give every camera its own image")]
     return []
+
+
+def _one_is_wrong(a: int, b: int, distances: Float[Array, "view view"], limit: float) -> bool:
+    """Tell whether two views disagree with each other, or one of them with most others and the other not.
+
+    Cameras side by side show much the same, and are both apart from a third that is wrong.
+    """
+    others = np.delete(distances[[a, b]], [a, b], axis=1)
+    counted = np.isfinite(others).sum(1)
+    first, second = 2 * (others > limit).sum(1) > counted
+    return bool(distances[a, b] > limit or first != second)
 
 
 def _alone(rig: Rig, distances: Array, limit: float) -> list[Finding]:
@@ -183,8 +202,9 @@ def _named_pairs(rig: Rig, distances: Array, limit: float) -> str:
     pairs = [pair for pair in combinations(range(rig.num_views), 2) if distances[pair] > limit]
     named = ", ".join(
         f"'{rig.names[a]}' and '{rig.names[b]}' {distances[a, b]:.0f} px"
-        for a, b in sorted(pairs, key=lambda pair: -distances[pair])
+        for a, b in sorted(pairs, key=lambda pair: -distances[pair])[:_MAX_NAMED]
     )
+    named += f" and {len(pairs) - _MAX_NAMED} pairs more" if len(pairs) > _MAX_NAMED else ""
     return f"{named} off each other's epipolar lines (median; expected below {limit:.0f} px)"
 
 

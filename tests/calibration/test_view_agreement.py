@@ -92,3 +92,15 @@ def test_epipolar_distances_are_the_noise(ring, seen):
     assert np.isnan(np.diag(distances)).all()
     # The median of |N(0, sigma)|.
     np.testing.assert_allclose(distances[~np.eye(4, dtype=bool)], 0.6745 * NOISE_PX, rtol=0.15)
+
+
+@pytest.mark.parametrize("num_views", [8, 24, 40])
+def test_cameras_side_by_side_are_not_taken_for_copies_when_another_is_wrong(num_views, ring, seen):
+    """A ring of many cameras, in which neighbours show much the same."""
+    rig = ring(num_views)
+    keypoints = seen(rig)
+    keypoints[:, :, 3] += 60
+    (found,) = judge_views(rig, keypoints)
+    assert found.name == "one view disagrees"
+    assert "without 'cam_3' the others" in str(found)
+    assert len(str(found)) < 1500
