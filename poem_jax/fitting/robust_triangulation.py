@@ -3,7 +3,7 @@
 For every joint each pair of views proposes a point (the middle of the shortest segment between its two rays)
 and the weighted DLT of all views proposes one more; all views vote on every proposal by their truncated
 reprojection error. The views that agree with the winner are its inliers, and Gauss-Newton steps on their
-reprojection error refine it. With few cameras this search is exhaustive: no random samples.
+reprojection error refine it. Up to 25 cameras this search is exhaustive: no random samples.
 
 Letters: r = reprojection residual (px); J = d r / d point (2 v, 3); w = confidence of a view; s = noise of
 one coordinate of a key point of confidence 1 (px), estimated from the residuals of a whole take with a
@@ -24,10 +24,13 @@ from poem_jax.fitting.observations import Observations, clean, point_information
 from poem_jax.geometry.cameras import normalised_from_pixels, project
 from poem_jax.geometry.transforms import invert_rigid, rotate_points, unit_vectors
 from poem_jax.geometry.triangulation import triangulate
-from poem_jax.typing import Array, Bool, Float, Num
+from poem_jax.typing import Array, Bool, Float, Int, Num
 
 REFERENCE_DIAGONAL_PX = math.hypot(1280, 720)
 """Of the images that defaults in pixels are meant for."""
+
+MAX_PAIRS = 300
+"""Pairs of views that propose a point: all, up to 25 views. Memory grows with pairs times views."""
 
 _STEPS = 4
 _MIN_VIEWS = 2
@@ -147,7 +150,7 @@ def _midpoints(
     rays = rotate_points(world_from_cam[..., :3, :3], jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], -1))
     rays = unit_vectors(rays)
     centres = world_from_cam[..., None, :3, 3]
-    a, b = np.array(list(combinations(range(uv.shape[-3]), 2))).T
+    a, b = _pairs(uv.shape[-3])
     d, e = rays[..., a, :, :], rays[..., b, :, :]
     between = centres[..., b, :, :] - centres[..., a, :, :]
     cosine, along_d, along_e = (
@@ -160,6 +163,18 @@ def _midpoints(
     middle = 0.5 * (centres[..., a, :, :] + depth_d * d + centres[..., b, :, :] + depth_e * e)
     both = (weights[..., a, :] > 0) & (weights[..., b, :] > 0)
     return middle, both & (sine2 > _PARALLEL)[..., 0] & (depth_d > 0)[..., 0] & (depth_e > 0)[..., 0]
+
+
+def _pairs(num_views: int) -> Int[Array, "2 pair"]:
+    """Return all pairs of views; of many views so many pairs that each view is in as many as any other."""
+    pairs = np.array(list(combinations(range(num_views), 2)))
+    steps = max(1, MAX_PAIRS // num_views)
+    if len(pairs) > MAX_PAIRS:
+        # Neighbours in the rig's order up to opposite ones.
+        apart = np.unique(np.linspace(1, num_views // 2, steps).round().astype(int))
+        first = np.arange(num_views)
+        pairs = np.concatenate([np.stack([first, (first + step) % num_views], 1) for step in apart])
+    return pairs.T
 
 
 def _square_errors(

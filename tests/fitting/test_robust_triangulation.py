@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from poem_jax.fitting import Observations, triangulate_robust
+from poem_jax.fitting.robust_triangulation import MAX_PAIRS, _pairs
 from poem_jax.geometry.cameras import project, projection_jacobian
 from tests.fitting.observed import observed
 
@@ -156,3 +157,21 @@ def test_bad_shapes_raise(takes):
         triangulate_robust(Observations(take.uv_px[:, :1], None, take.K[:1], take.T_cam_from_world[:1]))
     with pytest.raises(ValueError, match="3 views, the cameras 2"):
         triangulate_robust(observed(take, K=take.K[:2], T_cam_from_world=take.T_cam_from_world[:2]))
+
+
+@pytest.mark.parametrize("views", [2, 25, 26, 40, 120])
+def test_each_view_is_in_as_many_pairs_as_any_other(views):
+    pairs = _pairs(views)
+    assert pairs.shape[1] <= MAX_PAIRS
+    assert (pairs[0] != pairs[1]).all()
+    assert np.ptp(np.bincount(pairs.ravel(), minlength=views)) == 0
+
+
+def test_outliers_are_found_among_many_cameras(takes):
+    take = takes(2, 30, 0.5, 2)
+    uv = take.uv_px.copy()
+    uv[:, ::3] += 50
+    found = robust(observed(take, uv_px=uv), frame_axis=0)
+    expected = np.broadcast_to(np.arange(30)[:, None] % 3 > 0, uv.shape[:-1])
+    assert (np.asarray(found.inlier_mask) == expected).mean() > 0.99
+    assert error_mm(found.points, take).max() < 2
