@@ -7,8 +7,9 @@ and what it needs are imported by `start` alone, so that Ctrl-C ends the program
 import sys
 from collections.abc import Sequence
 
-USAGE_ERROR = 2
-STOPPED_BY_SIGINT = 130
+from poem_jax.cli.signals import USAGE_ERROR, exit_code
+
+__all__ = ["USAGE_ERROR", "main", "start"]
 
 
 def start(arguments: Sequence[str] | None = None) -> int:
@@ -17,9 +18,9 @@ def start(arguments: Sequence[str] | None = None) -> int:
         from poem_jax.cli.run import start as run
 
         return run(arguments)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as request:
         print("poem: stopped by SIGINT", file=sys.stderr)
-        return STOPPED_BY_SIGINT
+        return exit_code(request)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from poem_jax.cli import USAGE_ERROR
 from poem_jax.cli.demo import Demo
 from poem_jax.cli.detect import Detect
 from poem_jax.cli.evaluate import Eval
@@ -16,7 +15,7 @@ from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.messages import set_up_logging
 from poem_jax.cli.reconstruct import Reconstruct
-from poem_jax.cli.signals import UntilReaderLeaves, exit_code, stop_on_signals
+from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop_on_signals
 from poem_jax.cli.train import Train
 
 Command = Demo | Reconstruct | Fit | Detect | Train | Eval | ImportTorch | ExportTorch

@@ -11,6 +11,8 @@ from typing import Any, TextIO
 
 from poem_jax.io.stopping import Stopped
 
+USAGE_ERROR = 2
+"""Exit code for wrong input."""
 STOPPED = 128
 """What the number of the signal that ended a program is added to, for its exit code."""
 
