@@ -33,10 +33,10 @@ from poem_jax.models.config import (
     DecoderConfig,
     DecoderOutput,
     Design,
+    FirstQueries,
     HeatActivation,
     HRNetConfig,
     NeighbourSearch,
-    QueryStart,
     Similarity,
     Stem,
     ViewWeights,
@@ -389,7 +389,7 @@ def plain_start(
     """Return the query points before the first layer, basis radii about the root; `joints` in metres."""
     template, order = params["constants"]["template_queries"], config.decoder.query_order
     posed = jnp.broadcast_to(template, (joints.shape[0], *template.shape))
-    if config.decoder.query_start is QueryStart.JOINTS:
+    if config.decoder.first_queries is FirstQueries.JOINTS:
         length = jnp.maximum(jnp.linalg.norm(joints, axis=-1, keepdims=True), 1e-6)
         joints = joints * jnp.minimum(1.0, 1.5 * config.basis.radius / length)
         vertices = pose_by_joints(_hand(params), *split_queries(template, order), joints)

@@ -250,7 +250,7 @@ class NeighbourSearch(enum.StrEnum):
     ONCE = "once"
 
 
-class QueryStart(enum.StrEnum):
+class FirstQueries(enum.StrEnum):
     """Where the query points stand before the first layer."""
 
     TEMPLATE = "template"
@@ -283,7 +283,7 @@ class DecoderConfig:
     points, in the first layer fixed ones; a branch regresses offsets before the feed-forward network."""
     dropout: float = 0.0
     """Share of numbers dropped in training, where the release drops them."""
-    query_start: QueryStart = QueryStart.TEMPLATE
+    first_queries: FirstQueries = FirstQueries.TEMPLATE
     neighbour_search: NeighbourSearch = NeighbourSearch.EVERY_LAYER
     cross_attention_basis_stride: int = 1
     """The cross-attention reads every n-th basis point."""
@@ -378,6 +378,6 @@ class Config:
             f"alike, so `basis.num_points` must be at least {NUM_QUERIES}; got {self.basis.num_points}",
         )
         require(
-            self.decoder.query_start is QueryStart.TEMPLATE or self.root.num_joints == NUM_JOINTS,
-            f"`query_start` = joints needs `root.num_joints` = {NUM_JOINTS}; got {self.root.num_joints}",
+            self.decoder.first_queries is FirstQueries.TEMPLATE or self.root.num_joints == NUM_JOINTS,
+            f"`first_queries` = joints needs `root.num_joints` = {NUM_JOINTS}; got {self.root.num_joints}",
         )

@@ -17,8 +17,12 @@ _T = TypeVar("_T")
 _KIND = "kind"
 _SYNTHETIC_CROP = 1.5
 """Crop ratio of our own models, which files of earlier versions do not say."""
-_MOVED = {"feature_stride": ("features", "stride"), "similarity": ("aggregation", "similarity")}
-"""Keys of the whole model that belong to one of its parts now; files of earlier versions have them."""
+_MOVED = {
+    "feature_stride": ("features", "stride"),
+    "similarity": ("aggregation", "similarity"),
+    "decoder.query_start": ("decoder", "first_queries"),
+}
+"""Keys of files of earlier versions, and the part and the name that they have now."""
 _ONE_BY_ONE = {
     "branch_bias": ("features", False, True),
     "root.pooling": ("root", 1, 2),
@@ -68,14 +72,11 @@ def _of_today(values: dict[str, Any]) -> dict[str, Any]:
     """Bring what a file of an earlier version says into today's form."""
     kept = {key: dict(value) if isinstance(value, dict) else value for key, value in values.items()}
     for key, (part, name) in _MOVED.items():
-        if key in kept:
-            _put(kept, part, name, kept.pop(key))
+        for value in _taken(kept, key):
+            _put(kept, part, name, value)
     said: dict[str, dict[str, int]] = {}
     for key, (part, *forms) in _ONE_BY_ONE.items():
-        owner = kept.get(key.split(".")[0], {}) if "." in key else kept
-        name = key.split(".")[-1]
-        if isinstance(owner, dict) and name in owner:
-            value = owner.pop(name)
+        for value in _taken(kept, key):
             require(value in forms, f"`config.{key}` must be one of {forms}; got {_short(value)}")
             said.setdefault(part, {})[key] = forms.index(value)
     for part, choices in said.items():
@@ -88,6 +89,13 @@ def _of_today(values: dict[str, Any]) -> dict[str, Any]:
     if "crop" not in kept and not _is_released(kept):
         kept["crop"] = {"ratio": _SYNTHETIC_CROP}
     return kept
+
+
+def _taken(values: dict[str, Any], key: str) -> list[Any]:
+    """Remove a key, `name` or `part.name`; return what it said, or nothing."""
+    part, _, name = key.rpartition(".")
+    owner = values.get(part) if part else values
+    return [owner.pop(name)] if isinstance(owner, dict) and name in owner else []
 
 
 def _put(values: dict[str, Any], part: str, name: str, value: Any) -> None:

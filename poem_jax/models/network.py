@@ -20,7 +20,7 @@ from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import join_queries
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import HRNet, ResNet
-from poem_jax.models.config import Config, DecoderOutput, Design, HRNetConfig, QueryStart
+from poem_jax.models.config import Config, DecoderOutput, Design, FirstQueries, HRNetConfig
 from poem_jax.models.decoder import Decoder, Surroundings
 from poem_jax.models.hand_output import (
     ParameterRegressor,
@@ -196,7 +196,7 @@ class Poem(nnx.Module):
     def prepared_surroundings(self) -> Surroundings | None:
         """Return the same with all that is constant in it computed."""
         first = self.first_surroundings()
-        if first is None or self.config.decoder.query_start is not QueryStart.TEMPLATE:
+        if first is None or self.config.decoder.first_queries is not FirstQueries.TEMPLATE:
             return first
         start = self.template_queries[...] / self.config.basis.radius
         return self.decoder.layers[0].with_deltas(start[None], first)  # pyright: ignore[reportAttributeAccessIssue]
@@ -225,7 +225,7 @@ class Poem(nnx.Module):
     def _start(self, joints: Array, solved: Array) -> Float[Array, "batch query 3"]:
         """Return the query points before the first layer, metres about the root."""
         template, order = self.template_queries[...], self.config.decoder.query_order
-        if self.config.decoder.query_start is QueryStart.TEMPLATE:
+        if self.config.decoder.first_queries is FirstQueries.TEMPLATE:
             return jnp.broadcast_to(template, (joints.shape[0], *template.shape))
         return first_queries(self.hand.model(), template, joints, solved, self.config.basis.radius, order)
 

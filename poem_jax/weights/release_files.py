@@ -18,7 +18,7 @@ from poem_jax.models.config import Config
 from poem_jax.models.presets import preset
 from poem_jax.typing import Float, Int
 from poem_jax.weights import store
-from poem_jax.weights.release_keys import hand_prefixes, live_entries
+from poem_jax.weights.release_keys import hand_prefixes, used_rows
 from poem_jax.weights.torch_import import VARIANTS, check_anchors, convert, export_state_dict
 
 BASIS_FILE, ANCHOR_FILE, INDEX_FILE = "bps.npy", "anchor.npy", "anchor_idx.npy"
@@ -164,7 +164,7 @@ def _check_folder(out: Path, overwrite: bool) -> None:
 
 def _num_read(names: Iterable[str], config: Config) -> int:
     """Count the names of a state dict whose arrays `convert` uses."""
-    used = {entry.source for entry in live_entries(config)}
+    used = {row.source for row in used_rows(config)}
     hands = [prefix for prefix, is_used in hand_prefixes(config).items() if is_used]
     used |= {f"{prefix}th_{field}" for prefix in hands for field in _READ_OF_A_HAND}
     return sum(name.removeprefix("module.") in used for name in names)

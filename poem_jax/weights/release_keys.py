@@ -1,6 +1,6 @@
 """Names of the released POEM-v2 models: the arrays that matter, and those that no output depends on.
 
-`live_entries` and `dead_shapes` together are the whole state dict, but for the buffers that
+`used_rows` and `unused_shapes` together are the whole state dict, but for the buffers that
 hold the MANO asset (`hand_prefixes`).
 """
 
@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, NUM_SHAPES, NUM_SKELETON_JOINTS
 from poem_jax.models.config import Config, DecoderOutput, HRNetConfig
-from poem_jax.weights.entries import Entries, Entry, conv_norm, convolution, layer_norm, linear
-from poem_jax.weights.trunk_keys import hrnet_entries
+from poem_jax.weights.name_table import NameRow, NameRows, conv_norm, convolution, layer_norm, linear
+from poem_jax.weights.trunk_keys import hrnet_rows
 
 TRUNK = "img_backbone."
 HEAD = "ptEmb_head."
@@ -27,10 +27,10 @@ def is_parametric(config: Config) -> bool:
     return config.decoder.output is DecoderOutput.HAND_PARAMETERS
 
 
-def live_entries(config: Config) -> Entries:
+def used_rows(config: Config) -> NameRows:
     """List the arrays that the forward pass uses."""
     assert isinstance(config.backbone, HRNetConfig)
-    yield from hrnet_entries(config.backbone, TRUNK)
+    yield from hrnet_rows(config.backbone, TRUNK)
     for i in range(3):
         for name, path in (("feat", "features.branch.reductions"), ("uv", "heat_maps.branch.merges")):
             source = f"{name}_delayer.{i}"
@@ -42,16 +42,16 @@ def live_entries(config: Config) -> Entries:
     for i, network in enumerate(("theta", "phi")):
         yield from linear(f"{HEAD}merge_net_feature.{i}.0", f"aggregation.{network}_in")
         yield from linear(f"{HEAD}merge_net_feature.{i}.2", f"aggregation.{network}_out")
-    yield Entry(f"{HEAD}query_feat_embedding.weight", "trainable.decoder.embeddings")
+    yield NameRow(f"{HEAD}query_feat_embedding.weight", "trainable.decoder.embeddings")
     last = config.decoder.num_layers - 1
     for i in range(last + 1):
-        yield from _layer_entries(i, moves=i < last or not is_parametric(config), is_last=i == last)
+        yield from _layer_rows(i, moves=i < last or not is_parametric(config), is_last=i == last)
     if is_parametric(config):
         yield from linear(f"{_BLOCKS}{last}.flat_verts", "regressor.pool")
         yield from linear(f"{_BLOCKS}{last}.mano_linear", "regressor.regress")
 
 
-def _layer_entries(i: int, *, moves: bool, is_last: bool) -> Entries:
+def _layer_rows(i: int, *, moves: bool, is_last: bool) -> NameRows:
     source, path = f"{_BLOCKS}{i}", f"decoder.layers.{i}"
     yield from linear(f"{source}.embedding", f"{path}.embed")
     for n, (theirs, ours) in enumerate((("attn", "self_attention"), ("cross_attn", "cross_attention"))):
@@ -60,7 +60,7 @@ def _layer_entries(i: int, *, moves: bool, is_last: bool) -> Entries:
         yield from linear(f"{source}.encoder.{theirs}.output.dense", f"{path}.{ours}.out")
         yield from layer_norm(f"{source}.encoder.{theirs}.output.LayerNorm", f"{path}.norms.{n}")
     for theirs, ours in (("self", "queries"), ("cross", "basis")):
-        yield from _vector_entries(
+        yield from _vector_rows(
             f"{source}.encoder.vec_attn.query_{theirs}_attn", f"{path}.vector_attention.{ours}"
         )
     if moves:
@@ -72,7 +72,7 @@ def _layer_entries(i: int, *, moves: bool, is_last: bool) -> Entries:
         yield from layer_norm(f"{source}.encoder.output.LayerNorm", f"{path}.feed_forward.norm")
 
 
-def _vector_entries(source: str, path: str) -> Entries:
+def _vector_rows(source: str, path: str) -> NameRows:
     yield from linear(f"{source}.fc1", f"{path}.before")
     yield from linear(f"{source}.fc2", f"{path}.after")
     for theirs, ours in (("w_qs", "alpha"), ("w_ks", "beta"), ("w_vs", "psi")):
@@ -91,19 +91,19 @@ def hand_prefixes(config: Config) -> dict[str, bool]:
     return prefixes
 
 
-def dead_shapes(config: Config) -> dict[str, tuple[int, ...]]:
+def unused_shapes(config: Config) -> dict[str, tuple[int, ...]]:
     """Return name and shape of every array that no output depends on, but for the hand's buffers."""
-    shapes = dict(_dead_trunk(config))
-    shapes |= dict(_dead_head(config.width))
+    shapes = dict(_unused_trunk(config))
+    shapes |= dict(_unused_head(config.width))
     last = config.decoder.num_layers - 1
     for i in range(last + 1):
-        shapes |= dict(_dead_layer(i, config, is_last=i == last))
-    norms = [e.source for e in live_entries(config) if e.source.endswith(".running_mean")]
+        shapes |= dict(_unused_layer(i, config, is_last=i == last))
+    norms = [e.source for e in used_rows(config) if e.source.endswith(".running_mean")]
     norms += [name for name in shapes if name.endswith(".running_mean")]
     return shapes | {name.replace("running_mean", "num_batches_tracked"): () for name in norms}
 
 
-def _dead_trunk(config: Config) -> Shapes:
+def _unused_trunk(config: Config) -> Shapes:
     """The classification head of HRNet, and a branch that would read the heat maps."""
     assert isinstance(config.backbone, HRNetConfig)
     channels, inner = config.backbone.channels, (32, 64, 128, 256)
@@ -128,7 +128,7 @@ def _dead_trunk(config: Config) -> Shapes:
     yield from _norm("uv_in.norm", channels[1])
 
 
-def _dead_head(width: int) -> Shapes:
+def _unused_head(width: int) -> Shapes:
     half = width // 2
     networks = {
         "center_shift_layer": ((NUM_QUERIES, NUM_QUERIES), (1, NUM_QUERIES)),
@@ -145,7 +145,7 @@ def _dead_head(width: int) -> Shapes:
     yield from _layer(f"{HEAD}layer_global_feat", (width, _GLOBAL_NUMBERS))
 
 
-def _dead_layer(i: int, config: Config, *, is_last: bool) -> Shapes:
+def _unused_layer(i: int, config: Config, *, is_last: bool) -> Shapes:
     source, width = f"{_BLOCKS}{i}", config.width
     for name, rows in (("word", _WORDS), ("position", _POSITIONS), ("token_type", _TYPES)):
         yield f"{source}.embeddings.{name}_embeddings.weight", (rows, width)

@@ -24,16 +24,16 @@ from poem_jax.models.hand_output import template_queries
 from poem_jax.models.network import describe, with_static_indices
 from poem_jax.models.presets import preset
 from poem_jax.typing import Float, Int, Params
-from poem_jax.weights.entries import read_entries, write_entries
+from poem_jax.weights.name_table import read_rows, write_rows
 from poem_jax.weights.release_keys import (
     HEAD,
-    dead_shapes,
     hand_prefixes,
     is_parametric,
-    live_entries,
+    unused_shapes,
+    used_rows,
 )
 from poem_jax.weights.store import expected_leaves, flatten, unflatten
-from poem_jax.weights.trunk_keys import trunk_entries
+from poem_jax.weights.trunk_keys import trunk_rows
 
 VARIANTS = ("v2-small", "v2-medium", "v2-large", "v2-medium-mano")
 """The released models; each is the preset of that name with the suffix `-release`."""
@@ -94,7 +94,7 @@ def convert(
     config = preset(f"{variant}-release")
     hand = _right_hand(mano)
     state = _without_prefix(state_dict)
-    leaves, problems = read_entries(list(live_entries(config)), state, expected_leaves(config))
+    leaves, problems = read_rows(list(used_rows(config)), state, expected_leaves(config))
     problems += _unknown_or_unlike(state, config)
     if problems:
         raise ValueError(_report(problems, state, variant))
@@ -117,8 +117,8 @@ def export_state_dict(config: Config, params: Params) -> dict[str, np.ndarray]:
             f"{', '.join(f'{variant}-release' for variant in VARIANTS)}; got another config"
         )
     leaves = flatten(params)
-    state = write_entries(list(live_entries(config)), leaves)
-    for name, shape in dead_shapes(config).items():
+    state = write_rows(list(used_rows(config)), leaves)
+    for name, shape in unused_shapes(config).items():
         state[name] = _neutral(name, shape)
     hand = HandModel(**{name: np.asarray(leaves[f"constants.hand.{name}"]) for name in HandModel._fields})
     for prefix in hand_prefixes(config):
@@ -140,9 +140,9 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: P
     """
     trunk: HRNetConfig | ResNetConfig = config.backbone
     state = _without_prefix(state_dict)
-    entries = list(trunk_entries(trunk))
-    leaves, problems = read_entries(entries, state, expected_leaves(config))
-    known = {entry.source for entry in entries}
+    rows = list(trunk_rows(trunk))
+    leaves, problems = read_rows(rows, state, expected_leaves(config))
+    known = {row.source for row in rows}
     problems += [
         f"{name}: unknown, got shape {array.shape}"
         for name, array in state.items()
@@ -198,9 +198,9 @@ def _right_hand(mano: HandModel | str | Path) -> HandModel:
 
 def _unknown_or_unlike(state: dict[str, np.ndarray], config: Config) -> list[str]:
     """List the problems of everything that the forward pass does not use."""
-    shapes = dead_shapes(config)
+    shapes = unused_shapes(config)
     shapes |= {prefix + name: shape for prefix in hand_prefixes(config) for name, shape in _BUFFERS.items()}
-    live = {entry.source for entry in live_entries(config)}
+    live = {row.source for row in used_rows(config)}
     problems = [f"{name}: missing, expected {shape}" for name, shape in shapes.items() if name not in state]
     for name, array in state.items():
         if name in shapes and array.shape != shapes[name]:

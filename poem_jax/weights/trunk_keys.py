@@ -3,24 +3,22 @@
 from collections.abc import Iterator
 
 from poem_jax.models.config import HRNetConfig, ResNetConfig, Stem
-from poem_jax.weights.entries import Entries, conv_norm
+from poem_jax.weights.name_table import NameRows, conv_norm
 
 _BASIC = ((1, "first"), (2, "second"))
 _BOTTLENECK = ((1, "reduce"), (2, "middle"), (3, "expand"))
 
 
-def trunk_entries(config: HRNetConfig | ResNetConfig, prefix: str = "") -> Entries:
+def trunk_rows(config: HRNetConfig | ResNetConfig, prefix: str = "") -> NameRows:
     """List every array of a trunk.
 
     Raises:
         ValueError: a trunk that has no counterpart in PyTorch.
     """
-    return (
-        hrnet_entries(config, prefix) if isinstance(config, HRNetConfig) else resnet_entries(config, prefix)
-    )
+    return hrnet_rows(config, prefix) if isinstance(config, HRNetConfig) else resnet_rows(config, prefix)
 
 
-def hrnet_entries(config: HRNetConfig, prefix: str = "") -> Entries:
+def hrnet_rows(config: HRNetConfig, prefix: str = "") -> NameRows:
     """List an HRNet: `conv1`, `layer1.0.conv1`, `stage2.0.branches.0.0.conv1`, ... after `prefix`."""
     for i in (1, 2):
         yield from conv_norm(f"{prefix}conv{i}", f"{prefix}bn{i}", f"trunk.stem.{i - 1}")
@@ -39,7 +37,7 @@ def hrnet_entries(config: HRNetConfig, prefix: str = "") -> Entries:
             yield from _exchange_module(config, stage, m, f"{prefix}stage{stage}.{m}")
 
 
-def _exchange_module(config: HRNetConfig, stage: int, module: int, source: str) -> Entries:
+def _exchange_module(config: HRNetConfig, stage: int, module: int, source: str) -> NameRows:
     path = f"trunk.stage{stage}.blocks"
     for branch in range(stage):
         for block in range(config.blocks):
@@ -68,7 +66,7 @@ def _fusion_names(source: str, origin: int, target: int) -> Iterator[tuple[str, 
             yield f"{source}.{i}", f"convs.{i}"
 
 
-def resnet_entries(config: ResNetConfig, prefix: str = "") -> Entries:
+def resnet_rows(config: ResNetConfig, prefix: str = "") -> NameRows:
     """List a ResNet under torchvision's names."""
     if config.stem is not Stem.CONVOLUTION:
         raise ValueError(f"a ResNet with the stem {config.stem.value!r} has no counterpart in torchvision")
@@ -85,6 +83,6 @@ def resnet_entries(config: ResNetConfig, prefix: str = "") -> Entries:
 
 def _block(
     source: str, path: str, parts: tuple[tuple[int, str], ...], index: tuple[int, ...] = ()
-) -> Entries:
+) -> NameRows:
     for number, part in parts:
         yield from conv_norm(f"{source}.conv{number}", f"{source}.bn{number}", f"{path}.{part}", index)

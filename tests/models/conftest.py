@@ -16,8 +16,8 @@ from poem_jax.models.config import (
     Config,
     DecoderOutput,
     Design,
+    FirstQueries,
     HRNetConfig,
-    QueryStart,
     RootConfig,
     Similarity,
 )
@@ -72,7 +72,7 @@ def micro_config() -> Config:
 @pytest.fixture(scope="session")
 def joints_config() -> Config:
     """All 21 joints, which also pose the template."""
-    decoder = replace(_MICRO.decoder, query_start=QueryStart.JOINTS, embed_coordinates=True)
+    decoder = replace(_MICRO.decoder, first_queries=FirstQueries.JOINTS, embed_coordinates=True)
     return replace(_MICRO, root=RootConfig(num_joints=21), decoder=decoder)
 
 

@@ -9,8 +9,8 @@ from poem_jax.models.config import (
     Config,
     DecoderConfig,
     FeatureConfig,
+    FirstQueries,
     HRNetConfig,
-    QueryStart,
     ResNetConfig,
     RootConfig,
 )
@@ -138,8 +138,8 @@ def test_a_whole_number_is_a_good_float():
         (lambda: RootConfig(num_joints=16), "`num_joints` must be 1"),
         (lambda: ResNetConfig(blocks=(1, 2)), "must name the same stages"),
         (
-            lambda: Config(decoder=DecoderConfig(query_start=QueryStart.JOINTS)),
-            "`query_start` = joints needs",
+            lambda: Config(decoder=DecoderConfig(first_queries=FirstQueries.JOINTS)),
+            "`first_queries` = joints needs",
         ),
     ],
 )

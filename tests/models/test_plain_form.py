@@ -2,7 +2,7 @@
 
 The oracle shares no projection, triangulation, sampling or change of frame with the package
 (`numpy_geometry.py`), and its learned parts are those of `benchmarks/plain_form.py`. What it shares: the hand
-model and its posing by joints, tested in `tests/hand` and `test_query_start.py`.
+model and its posing by joints, tested in `tests/hand` and `test_hand_output.py`.
 """
 
 import functools

@@ -31,8 +31,8 @@ from poem_jax.models.config import Config
 from poem_jax.models.network import forward
 from poem_jax.training.state import clip_each_tensor
 from poem_jax.typing import Array, Params
-from poem_jax.weights.entries import write_entries
-from poem_jax.weights.release_keys import dead_shapes, live_entries
+from poem_jax.weights.name_table import write_rows
+from poem_jax.weights.release_keys import unused_shapes, used_rows
 from poem_jax.weights.store import flatten
 from tests.weights.procedural import (
     IMAGE_HW,
@@ -96,10 +96,10 @@ def step(train: bool) -> Step:
         run = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames=("config", "train"))
         (total, aux), gradients = run(params["trainable"], params, batch, config=config, train=train)
     terms, prediction, statistics = jax.tree.map(np.asarray, aux)
-    entries = list(live_entries(config))
+    entries = list(used_rows(config))
     leaves = flatten(jax.tree.map(np.asarray, {"trainable": gradients, "statistics": statistics}))
     groups = {
-        group: write_entries([e for e in entries if e.path.startswith(group)], leaves)
+        group: write_rows([e for e in entries if e.path.startswith(group)], leaves)
         for group in ("trainable", "statistics")
     }
     return Step(named_losses(float(total), terms), prediction, groups["trainable"], groups["statistics"])
@@ -253,7 +253,7 @@ def check_buffer(key: str) -> None:
 def check_not_built(key: str) -> None:
     """Our models have no branch `uv_in`, whose result the release discards, and count no batches."""
     name = key.removeprefix("after_one_train_forward/")
-    assert name in dead_shapes(released("small")[0])
+    assert name in unused_shapes(released("small")[0])
     assert name not in step(train=True).buffers
 
 

@@ -17,11 +17,11 @@ from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
 from poem_jax.models.network import describe
 from poem_jax.models.presets import preset
 from poem_jax.typing import Params
-from poem_jax.weights.entries import write_entries
-from poem_jax.weights.release_keys import dead_shapes, hand_prefixes, live_entries
+from poem_jax.weights.name_table import write_rows
+from poem_jax.weights.release_keys import hand_prefixes, unused_shapes, used_rows
 from poem_jax.weights.store import flatten
 from poem_jax.weights.torch_import import convert, export_state_dict, import_trunk
-from poem_jax.weights.trunk_keys import trunk_entries
+from poem_jax.weights.trunk_keys import trunk_rows
 from tests.weights.procedural import (
     REFERENCE,
     VARIANTS,
@@ -85,11 +85,11 @@ def test_procedural_weights_are_those_of_the_reference(model: str) -> None:
 def test_tables_are_the_manifest(model: str) -> None:
     """What matters, what does not and the hand's buffers make up the whole state dict, each name once."""
     config = preset(f"{VARIANTS[model]}-release")
-    live = [entry.source for entry in live_entries(config)]
+    live = [entry.source for entry in used_rows(config)]
     hands = hand_prefixes(config)
     weights = [entry for entry in manifest(model) if not entry.hand_field]
     assert sorted(live) == sorted(entry.name for entry in weights if entry.used)
-    assert dead_shapes(config) == {entry.name: entry.shape for entry in weights if not entry.used}
+    assert unused_shapes(config) == {entry.name: entry.shape for entry in weights if not entry.used}
     buffers = [entry for entry in manifest(model) if entry.hand_field]
     prefixes = {entry.name.rpartition("th_")[0] for entry in buffers}
     assert hands == {p: any(e.used for e in buffers if e.name.startswith(p)) for p in prefixes}
@@ -318,7 +318,7 @@ def test_trunks_take_all_arrays_and_leave_the_rest(trunk) -> None:
     config, state = trunk
     params = empty_params(config)
     filled = import_trunk({f"module.{name}": array for name, array in state.items()}, config, params)
-    back = write_entries(list(trunk_entries(config.backbone)), flatten(filled))
+    back = write_rows(list(trunk_rows(config.backbone)), flatten(filled))
     for name, array in back.items():
         np.testing.assert_array_equal(array, state[name], err_msg=name)
     ignored = ("incre_modules.", "downsamp_modules.", "final_layer.", "classifier.", "fc.")

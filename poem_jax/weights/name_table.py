@@ -1,0 +1,130 @@
+"""Tables that tie the names of a PyTorch state dict to the arrays of our models.
+
+A `NameRow` is one row: the foreign name, the dotted path in `params`, the place in a stack of equal blocks,
+and how the axes move. The tables list their rows for a config; the same rows serve import and export.
+"""
+
+import enum
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from poem_jax.typing import Array
+
+
+class Axes(enum.Enum):
+    """How a foreign array's axes become ours."""
+
+    SAME = None
+    TRANSPOSED = (1, 0)
+    """Linear layers: (out, in) -> (in, out)."""
+    OIHW_TO_HWIO = (2, 3, 1, 0)
+    """Convolutions."""
+
+    def to_ours(self, array: np.ndarray) -> np.ndarray:
+        """Move the axes of a foreign array."""
+        return array if self.value is None else array.transpose(self.value)
+
+    def to_foreign(self, array: np.ndarray) -> np.ndarray:
+        """Undo `to_ours`."""
+        return array if self.value is None else array.transpose(np.argsort(self.value))
+
+
+class NameRow(NamedTuple):
+    """One row of a table."""
+
+    source: str
+    """Name in the state dict."""
+    path: str
+    """Dotted path in `params`, its group first."""
+    axes: Axes = Axes.SAME
+    index: tuple[int, ...] = ()
+    """Place along the leading axes of an array that stacks the weights of equal blocks."""
+
+
+NameRows = Iterator[NameRow]
+
+
+def linear(source: str, path: str, *, bias: bool = True) -> NameRows:
+    """List a linear layer."""
+    yield NameRow(f"{source}.weight", f"trainable.{path}.kernel", Axes.TRANSPOSED)
+    if bias:
+        yield NameRow(f"{source}.bias", f"trainable.{path}.bias")
+
+
+def layer_norm(source: str, path: str) -> NameRows:
+    """List a layer norm."""
+    yield NameRow(f"{source}.weight", f"trainable.{path}.scale")
+    yield NameRow(f"{source}.bias", f"trainable.{path}.bias")
+
+
+def convolution(source: str, path: str, index: tuple[int, ...] = (), *, bias: bool = True) -> NameRows:
+    """List a convolution."""
+    yield NameRow(f"{source}.weight", f"trainable.{path}.kernel", Axes.OIHW_TO_HWIO, index)
+    if bias:
+        yield NameRow(f"{source}.bias", f"trainable.{path}.bias", index=index)
+
+
+def batch_norm(source: str, path: str, index: tuple[int, ...] = ()) -> NameRows:
+    """List a batch norm."""
+    for name, ours in (("weight", "trainable.{}.scale"), ("bias", "trainable.{}.bias")):
+        yield NameRow(f"{source}.{name}", ours.format(path), index=index)
+    for name, ours in (("running_mean", "statistics.{}.mean"), ("running_var", "statistics.{}.variance")):
+        yield NameRow(f"{source}.{name}", ours.format(path), index=index)
+
+
+def conv_norm(
+    conv: str, norm: str, path: str, index: tuple[int, ...] = (), *, bias: bool = False
+) -> NameRows:
+    """List a convolution and the batch norm that follows it."""
+    yield from convolution(conv, f"{path}.conv", index, bias=bias)
+    yield from batch_norm(norm, f"{path}.norm", index)
+
+
+def read_rows(
+    rows: list[NameRow], state: dict[str, np.ndarray], template: dict[str, Array]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Fill the leaves that `rows` name from a state dict.
+
+    Args:
+        rows: the table.
+        state: foreign arrays by name.
+        template: shape and dtype of our leaves by dotted path.
+
+    Returns: the leaves, and all problems: names that are missing, arrays of another shape or kind.
+    """
+    leaves: dict[str, np.ndarray] = {}
+    problems = []
+    for row in rows:
+        leaf = template[row.path]
+        expected = leaf.shape[len(row.index) :]
+        if row.source not in state:
+            problems.append(f"{row.source}: missing, expected for {row.path}")
+            continue
+        array = state[row.source]
+        if not _is_real(array) or len(expected) != array.ndim or row.axes.to_ours(array).shape != expected:
+            found = f"{array.dtype} of shape {array.shape}"
+            wanted = _foreign_shape(row, expected)
+            problems.append(f"{row.source}: expected floats of shape {wanted} for {row.path}, got {found}")
+            continue
+        target = leaves.setdefault(row.path, np.empty(leaf.shape, leaf.dtype))
+        target[row.index] = row.axes.to_ours(array)
+    return leaves, problems
+
+
+def write_rows(rows: list[NameRow], leaves: dict[str, Array]) -> dict[str, np.ndarray]:
+    """Undo `read_rows`: return the foreign arrays by name, contiguous."""
+    return {
+        row.source: np.ascontiguousarray(row.axes.to_foreign(np.asarray(leaves[row.path])[row.index]))
+        for row in rows
+    }
+
+
+def _is_real(array: np.ndarray) -> bool:
+    """Whether an array holds floats; those of ml_dtypes (bfloat16) have a kind of their own."""
+    return array.dtype.kind == "f" or array.dtype.name == "bfloat16"
+
+
+def _foreign_shape(row: NameRow, ours: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(int(n) for n in row.axes.to_foreign(np.empty(ours, np.bool_)).shape)
