@@ -19,9 +19,9 @@ from orbax.checkpoint import v1 as ocp
 from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.io.json_file import read_json
 from poem_jax.models.config import Config
-from poem_jax.models.config_json import from_values, to_json
 from poem_jax.models.network import StaticArray, describe, leaves_with_names, with_static_indices
 from poem_jax.typing import Array, Params, PyTree
+from poem_jax.weights.config_json import from_values, to_json
 
 CONFIG_FILE = "config.json"
 ARRAYS_FOLDER = "ckpt"

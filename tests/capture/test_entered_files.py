@@ -13,10 +13,7 @@ PACKAGE = Path(poem_jax.__file__).parent
 MAX_FILES = 25
 
 
-def test_reconstruct_enters_few_files_of_capture_and_models(micro_model, tmp_path):
-    from poem_jax.weights.store import save
-
-    save(tmp_path / "micro", *micro_model)
+def test_reconstruct_enters_few_files_of_capture_and_models(tmp_path):
     entered = set()
 
     def note(frame, event, _):
@@ -27,7 +24,7 @@ def test_reconstruct_enters_few_files_of_capture_and_models(micro_model, tmp_pat
     sys.setprofile(note)
     threading.setprofile(note)
     try:
-        reconstruct(read_take(capture), tmp_path / "out", checkpoint=tmp_path / "micro")
+        reconstruct(read_take(capture), tmp_path / "out")
     finally:
         sys.setprofile(None)
         threading.setprofile(None)

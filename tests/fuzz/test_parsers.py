@@ -30,8 +30,8 @@ from poem_jax.io.images import read_image
 from poem_jax.io.json_file import read_json
 from poem_jax.io.npz_file import read_npy
 from poem_jax.io.torch_file import load_state_dict
-from poem_jax.models.config_json import from_values, to_json
 from poem_jax.models.presets import preset
+from poem_jax.weights.config_json import from_values, to_json
 from tests.fuzz.mutations import Mutation, damage_archive, damage_bytes, damage_json, damage_png
 from tests.torch_pickles import legacy_bytes, ordered, storage, tensor, zip_bytes
 

@@ -14,8 +14,8 @@ from poem_jax.models.config import (
     ResNetConfig,
     RootConfig,
 )
-from poem_jax.models.config_json import from_json, to_json
 from poem_jax.models.presets import PRESETS, preset
+from poem_jax.weights.config_json import from_json, to_json
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))

@@ -12,8 +12,8 @@ import pytest
 
 import poem_jax
 from poem_jax.models.apply import init
-from poem_jax.models.config_json import to_json
 from poem_jax.weights import store
+from poem_jax.weights.config_json import to_json
 from tests.micro import MICRO
 
 
