@@ -304,3 +304,9 @@ def test_wrong_files(tmp_path):
     (tmp_path / "list.json").write_text("[1, 2]")
     with pytest.raises(ValueError, match="must hold a JSON object"):
         read_rig(tmp_path / "list.json")
+
+
+def test_the_reader_keeps_the_name_that_scripts_import():
+    from poem_jax.capture import rig_file
+
+    assert rig_file.read_rig is read_rig
