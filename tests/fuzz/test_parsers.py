@@ -89,9 +89,9 @@ def npz(**arrays: np.ndarray) -> bytes:
 
 
 def hand() -> dict[str, Any]:
-    """Fields of MANO, small where they can be: what is not structure is all zeros."""
+    """Fields of MANO, small where they can be: what is not structure is all zeros, but for its length."""
     return {
-        "v_template": np.zeros((778, 3), np.float16),
+        "v_template": np.eye(778, 3, dtype=np.float16) / 8,
         "shapedirs": np.zeros((778, 3, 10), np.float16),
         "posedirs": np.zeros((778, 3, 135), np.float16),
         "J_regressor": np.eye(16, 778),

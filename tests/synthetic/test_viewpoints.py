@@ -3,7 +3,7 @@ import pytest
 
 from poem_jax.geometry.cameras import project
 from poem_jax.synthetic.config import CameraConfig, CropConfig
-from poem_jax.synthetic.viewpoints import draw_viewpoints, unit_vectors
+from poem_jax.synthetic.viewpoints import directions_on_sphere, draw_viewpoints
 
 JOINTS = np.random.default_rng(0).normal(size=(21, 3)) * 0.05 + [0.4, -0.2, 0.7]
 
@@ -55,13 +55,13 @@ def test_optical_centres_and_distances():
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (3, 2)])
-def test_unit_vectors(batch):
+def test_directions_have_length_one(batch):
     u, v = np.random.default_rng(0).random((2, *batch))
-    np.testing.assert_allclose(np.linalg.norm(unit_vectors(u, v), axis=-1), np.ones(batch))
+    np.testing.assert_allclose(np.linalg.norm(directions_on_sphere(u, v), axis=-1), np.ones(batch))
 
 
 def test_directions_are_uniform():
-    vectors = unit_vectors(*np.random.default_rng(0).random((2, 20000)))
+    vectors = directions_on_sphere(*np.random.default_rng(0).random((2, 20000)))
     np.testing.assert_allclose(vectors.mean(0), 0, atol=0.02)
     for axis in range(3):
         shares = np.histogram(vectors[:, axis], bins=5, range=(-1, 1))[0] / 20000
