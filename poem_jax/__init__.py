@@ -31,6 +31,7 @@ _HOME = {
 }
 _ROOMS = (
     "calibration",
+    "detection",
     "evaluation",
     "experiments",
     "fitting",

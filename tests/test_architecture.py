@@ -25,6 +25,7 @@ FLOORS = {
     "losses": 5,
     "batch": 4,
     "hand": 4,
+    "detection": 5,
     "calibration": 3,
     "render": 3,
     "geometry": 2,
