@@ -102,9 +102,8 @@ def read_operators(data: bytes) -> Iterator[Operator]:
         inputs, outputs = (tuple(table.vector(field, np.dtype("<i4")).tolist()) for field in (1, 2))
         stored = {index: _stored(tensors[index], buffers) for index in inputs}
         if kind == "dequantise":
-            unpacked |= {
-                outputs[0]: array.astype(np.float32) for array in stored.values() if array is not None
-            }
+            (packed,) = (array for array in stored.values() if array is not None)
+            unpacked[outputs[0]] = packed.astype(np.float32)
             continue
         stored |= {index: unpacked[index] for index in inputs if index in unpacked}
         constants = tuple(array for array in stored.values() if array is not None)
