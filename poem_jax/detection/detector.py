@@ -41,11 +41,11 @@ class DetectedHand(NamedTuple):
     """How sure the network is that this is a hand, 0.5 to 1."""
 
 
-def find_hands(images: Sequence[UInt8[Array, "_ _ 3"]], *, max_hands: int = 2) -> list[list[DetectedHand]]:
+def find_hands(images: Sequence[Array], *, max_hands: int = 2) -> list[list[DetectedHand]]:
     """Find the hands in every image by itself.
 
     Args:
-        images: RGB, of any sizes, not mirrored.
+        images: RGB (h, w, 3) of uint8, of any sizes, not mirrored.
         max_hands: Hands looked for in one image, the surest palms first.
 
     Returns: the hands of every image, none where there is none.
@@ -68,7 +68,7 @@ class HandTracker:
         self._max_hands = max_hands
         self._last: list[Region] = []
 
-    def find_hands(self, image: UInt8[Array, "h w 3"]) -> list[DetectedHand]:
+    def find_hands(self, image: Array) -> list[DetectedHand]:
         """Find the hands in the next frame; arguments and errors as `find_hands`."""
         _check([image], self._max_hands)
         regions = self._last
