@@ -1,0 +1,170 @@
+"""The same hand in all cameras and frames, from where its rays meet and not from the detector's side alone.
+
+Views are matched frame by frame (`hand_matching`), hands followed through the take (`hand_tracks`), and the
+detections of frames in which a hand is seen by one view only are joined to the track that expects them.
+Whatever is not sure is said in `warnings`.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from poem_jax.capture import association_words as words
+from poem_jax.capture.hand_choice import SIDES, kept_tracks, name_sides, trusted_tracks
+from poem_jax.capture.hand_matching import match_views
+from poem_jax.capture.hand_tracks import Track, follow_hands
+from poem_jax.capture.lone_detections import join_lone_detections
+from poem_jax.capture.sightings import NONE, Sightings, sightings_of_frames, vote_for_right
+from poem_jax.detection import DetectedHand
+from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.world_origin import distant_origin, move_origin
+from poem_jax.hand.topology import NUM_JOINTS
+from poem_jax.typing import Array, Float, Int
+
+
+class AssociatedHands(NamedTuple):
+    """The hands of a take: right before left, then by how much they were seen."""
+
+    keypoints_px: Float[Array, "frame hand view 21 2"]
+    """Raw pixels as given; NaN = unseen."""
+    score: Float[Array, "frame hand view"]
+    """Of the detections, 0.5 to 1; NaN = unseen."""
+    hand_side: tuple[str, ...]
+    """`right` or `left`."""
+    warnings: tuple[str, ...]
+    """What is not sure: what, where, and what to do."""
+
+
+_Found = Int[Array, "hand frame view"]
+
+
+def associate_hands(
+    detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig, *, max_hands: int = 2
+) -> AssociatedHands:
+    """Find which detections are the same hand in all views and frames, and of which side each hand is.
+
+    A hand must be seen by two views at once somewhere in the take, to have a place; where only one camera
+    sees hands at all, its detections are taken by their sides alone, with a warning.
+
+    Args:
+        detections: By frame, view (in the rig's order) and hand found; pixels of the raw images.
+        rig: The cameras.
+        max_hands: Hands returned at most, those followed best: 2 for one person.
+
+    Returns: see `AssociatedHands`. A second detection of one hand in one view, and what fits no hand, is left
+        out.
+
+    Raises:
+        ValueError: Views are not the rig's, `max_hands` is not positive, nothing was found, or no two views
+            agree on any hand.
+    """
+    _check(detections, rig, max_hands)
+    seeing = {view for views in detections for view, found in enumerate(views) if found}
+    if len(seeing) == 1:
+        return _by_side_alone(detections, rig, seeing.pop(), max_hands)
+    near = move_origin(rig.T_cam_from_world, distant_origin(rig.T_cam_from_world))
+    frames = sightings_of_frames(detections, rig._replace(T_cam_from_world=near))
+    followed = follow_hands([match_views(frame, max_hands) for frame in frames])
+    if not followed.tracks:
+        raise ValueError(
+            f"no two of the cameras {', '.join(rig.names)} agree on a hand in any frame, though hands were "
+            "found; check the rig (`poem calibration`), that frames are synchronous and views in its order"
+        )
+    kept = kept_tracks(followed.tracks, max_hands)
+    # Hands that are not kept hold their detections too, so that nobody else takes them.
+    trusted = trusted_tracks(followed.tracks)
+    found = _table([followed.tracks[i] for i in trusted], len(frames), rig.num_views)
+    every, doubtful = join_lone_detections(frames, [followed.tracks[i] for i in trusted], found)
+    found = every[[trusted.index(i) for i in kept]]
+    sides, of_sides = name_sides(_votes(frames, found))
+    order = sorted(range(len(kept)), key=lambda i: (SIDES.index(sides[i]), -(found[i] != NONE).sum()))
+    names = words.names([sides[i] for i in order])
+    named = {kept[i]: name for i, name in zip(order, names, strict=True)}
+    warnings = [
+        *(message.format(*(names[order.index(i)] for i in hands)) for message, hands in of_sides),
+        *words.unsure_matches(followed, named, rig),
+        *words.unsure_tracks(followed, named),
+        *words.suspicious_jumps(followed, named),
+        *words.others(followed.tracks, kept, max_hands),
+        *words.doubtful_lone(doubtful, rig),
+        *words.unconfirmed(frames, every, followed.tracks, rig),
+    ]
+    keypoints, scores = _entries(detections, frames, found[order])
+    return AssociatedHands(keypoints, scores, tuple(sides[i] for i in order), tuple(warnings))
+
+
+def _check(detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig, max_hands: int) -> None:
+    if max_hands < 1:
+        raise ValueError(f"`max_hands` must be 1 or more; got {max_hands}")
+    for frame, views in enumerate(detections):
+        if len(views) != rig.num_views:
+            raise ValueError(
+                f"`detections` must hold the {rig.num_views} views of the rig ({', '.join(rig.names)}) in "
+                f"every frame; frame {frame} has {len(views)}"
+            )
+    if not any(found for views in detections for found in views):
+        raise ValueError(
+            f"no hand was found in any image of {len(detections)} frames and {rig.num_views} views; check "
+            "that the images show hands, upright and lit, or give boxes or key points instead"
+        )
+
+
+def _table(tracks: Sequence[Track], num_frames: int, num_views: int) -> _Found:
+    found = np.full((len(tracks), num_frames, num_views), NONE)
+    for row, track in zip(found, tracks, strict=True):
+        for frame, hand in track.hands.items():
+            row[frame] = hand.found
+    return found
+
+
+def _votes(frames: Sequence[Sightings], found: _Found) -> list[Float[Array, " _"]]:
+    """Return the votes of all detections of every hand."""
+    return [
+        np.concatenate(
+            [frame.votes[row[row != NONE]] for frame, row in zip(frames, hand, strict=True)] or [np.zeros(0)]
+        )
+        for hand in found
+    ]
+
+
+def _entries(
+    detections: Sequence[Sequence[Sequence[DetectedHand]]], frames: Sequence[Sightings], found: _Found
+) -> tuple[Float[Array, "frame hand view 21 2"], Float[Array, "frame hand view"]]:
+    """Return key points and scores of the chosen detections."""
+    num_hands, num_frames, num_views = found.shape
+    keypoints = np.full((num_frames, num_hands, num_views, NUM_JOINTS, 2), np.nan)
+    scores = np.full((num_frames, num_hands, num_views), np.nan)
+    for hand, frame, view in np.argwhere(found != NONE):
+        chosen = detections[frame][view][frames[frame].number[found[hand, frame, view]]]
+        keypoints[frame, hand, view], scores[frame, hand, view] = chosen.keypoints_px, chosen.score
+    return keypoints, scores
+
+
+def _by_side_alone(
+    detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig, view: int, max_hands: int
+) -> AssociatedHands:
+    """Return the surest right and the surest left hand of every frame of the only camera that sees any."""
+    keypoints = np.full((len(detections), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
+    scores = np.full(keypoints.shape[:3], np.nan)
+    left_out: list[int] = []
+    for frame, views in enumerate(detections):
+        for hand in sorted(views[view], key=lambda hand: abs(vote_for_right(hand)) + hand.score):
+            place = frame, SIDES.index(hand.side), view
+            left_out += [frame] * bool(np.isfinite(scores[place]))
+            keypoints[place], scores[place] = hand.keypoints_px, hand.score
+    seen = np.isfinite(scores).sum((0, 2))
+    best = sorted(np.argsort(-seen, kind="stable")[:max_hands])
+    used = [int(i) for i in best if seen[i]]
+    warnings = [
+        f"only camera {rig.names[view]} sees hands: they are told apart by the detector's side alone, which "
+        "no second view confirms; check the sides"
+    ]
+    if left_out:
+        warnings.append(
+            f"camera {rig.names[view]} sees several hands of one side in "
+            f"{words.listed(sorted(set(left_out)))}; the surest was kept: check these images"
+        )
+    return AssociatedHands(
+        keypoints[:, used], scores[:, used], tuple(SIDES[i] for i in used), tuple(warnings)
+    )

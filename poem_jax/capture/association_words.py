@@ -1,0 +1,126 @@
+"""What is said of an association that is not sure: what, where, and what to do."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from poem_jax.capture.hand_choice import SIDES
+from poem_jax.capture.hand_matching import PlacedHand
+from poem_jax.capture.hand_tracks import Track, Tracks
+from poem_jax.capture.sightings import NONE, SAME_HAND_M, Sightings, ray_distances
+from poem_jax.geometry.rig import Rig
+from poem_jax.typing import Array, Bool, Int
+
+_MOST_NAMED = 5
+
+
+def names(sides: Sequence[str]) -> list[str]:
+    """Return the sides, numbered where several hands have one."""
+    return [
+        side if sides.count(side) == 1 else f"{side} (number {sides[: i + 1].count(side)})"
+        for i, side in enumerate(sides)
+    ]
+
+
+def unsure_matches(followed: Tracks, named: dict[int, str], rig: Rig) -> list[str]:
+    """Name the views of which another detection fits a hand as well."""
+    places: dict[tuple[str, int], list[int]] = {}
+    for number, name in named.items():
+        for frame, hand in followed.tracks[number].hands.items():
+            for view in hand.unsure_views:
+                places.setdefault((name, view), []).append(frame)
+    return [
+        f"camera {rig.names[view]} may show another hand as the {name} one in {listed(frames)}: its rays fit "
+        "badly, or those of both hands fit equally well; check these images"
+        for (name, view), frames in sorted(places.items())
+    ]
+
+
+def unsure_tracks(followed: Tracks, named: dict[int, str]) -> list[str]:
+    """Name the frames from which on hands could be exchanged."""
+    told = []
+    for frame, *pair in followed.unsure:
+        hands = sorted({named[i] for i in pair if i in named})
+        if hands:
+            told.append(
+                f"hands may be exchanged from frame {frame} on ({' and '.join(hands)}): place, motion and "
+                "sides fit another way nearly as well; check the images before and after"
+            )
+    return told
+
+
+def suspicious_jumps(followed: Tracks, named: dict[int, str]) -> list[str]:
+    """Name the hands that go on elsewhere, where several people's hands may be mixed up."""
+    rights = [track.vote > 0 for track in followed.tracks]
+    return [
+        f"the {named[i]} hand goes on far from where it was in frame {frame}, and other {side} hands are "
+        "there: it could be another person's from then on; check the images before and after"
+        for frame, i in followed.jumps
+        if i in named and rights.count(rights[i]) > 1
+        for side in (SIDES[0] if rights[i] else SIDES[1],)
+    ]
+
+
+def others(tracks: Sequence[Track], kept: Sequence[int], max_hands: int) -> list[str]:
+    """Tell of what was followed and is not kept."""
+    rest = [track for i, track in enumerate(tracks) if i not in kept]
+    if not rest:
+        return []
+    frames = listed(sorted({frame for track in rest for frame in track.hands}))
+    if len(kept) < max_hands:
+        return [
+            f"something like one more hand was seen in {frames}, too short a time to be trusted, and left "
+            "out; check these images if a hand is missing there"
+        ]
+    return [
+        f"other hands than the {len(kept)} kept were seen, in {frames}, and left out; if they are wanted "
+        f"give a larger `--max-hands` (now {max_hands}); where few views see the kept ones, check that they "
+        "are not mixed up with others"
+    ]
+
+
+def doubtful_lone(doubtful: Sequence[tuple[int, int]], rig: Rig) -> list[str]:
+    """Name the detections of one view that could be of either of two hands."""
+    return [
+        f"camera {rig.names[view]} alone sees a hand in {listed(frames)} that could be either of two; it is "
+        "left out there: check these images"
+        for view in sorted({view for _, view in doubtful})
+        for frames in ([frame for frame, seen_by in doubtful if seen_by == view],)
+    ]
+
+
+def unconfirmed(
+    frames: Sequence[Sightings], found: Int[Array, "hand frame view"], tracks: Sequence[Track], rig: Rig
+) -> list[str]:
+    """Name the views that see what no other view confirms, second detections of a hand left out."""
+    places: dict[int, list[int]] = {}
+    for frame, sightings in enumerate(frames):
+        hands = [track.hands[frame] for track in tracks if frame in track.hands]
+        used = np.concatenate([found[:, frame].ravel(), *(hand.found for hand in hands)])
+        free = np.setdiff1d(np.arange(len(sightings.view)), used)
+        for number in free[~_are_second(sightings, hands, free)]:
+            places.setdefault(int(sightings.view[number]), []).append(frame)
+    told = [f"{rig.names[view]} in {listed(sorted(set(where)))}" for view, where in sorted(places.items())]
+    return [
+        f"what looks like a hand to one camera and has no place in space is left out ({'; '.join(told)}): "
+        "look at these images if a hand is missing there"
+    ] * bool(told)
+
+
+def _are_second(
+    sightings: Sightings, hands: Sequence[PlacedHand], numbers: Int[Array, " n"]
+) -> Bool[Array, " n"]:
+    """Tell which detections show a hand of which their view has another one."""
+    second = np.zeros(len(numbers), dtype=bool)
+    for hand in hands:
+        near = ray_distances(sightings, hand.joints_world)[numbers] < SAME_HAND_M
+        second |= near & (hand.found[sightings.view[numbers]] != NONE)
+    return second
+
+
+def listed(frames: Sequence[int]) -> str:
+    """Return frames in words, the first few by number."""
+    first = ", ".join(map(str, frames[:_MOST_NAMED]))
+    if len(frames) <= _MOST_NAMED:
+        return f"frame{'s' * (len(frames) > 1)} {first}"
+    return f"{len(frames)} frames ({first}, ...)"
