@@ -7,14 +7,14 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-# Two host devices let the tests of data-parallel training run on a CPU; JAX reads this when it starts. Most of
-# the suite is compiling, so LLVM is spared its dearest passes.
+# Two host devices let the tests of data-parallel training run on a CPU; JAX reads this when it starts. Most
+# of the suite is compiling, so LLVM is spared its dearest passes.
 os.environ.setdefault(
     "XLA_FLAGS", "--xla_force_host_platform_device_count=2 --xla_llvm_disable_expensive_passes=true"
 )
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Devices that wait for each other hold a thread each of the shared pool, two more do the work. Many more would
-# fight for the cores: with 32, a fit of 64 frames takes three seconds instead of a fifth of one.
+# Devices that wait for each other hold a thread each of the shared pool, two more do the work. Many more
+# would fight for the cores: with 32, a fit of 64 frames takes three seconds instead of a fifth of one.
 os.environ.setdefault("PJRT_NPROC", "4")
 
 import pytest
