@@ -67,13 +67,8 @@ def load_network(checkpoint: str | os.PathLike | None) -> Network:
 def make_network(config: Config, params: Params, origin: str = "given") -> Network:
     """Prepare a model in memory.
 
-    Raises: ValueError: The parameters are of another config, or the crops are others than a capture gives.
+    Raises: ValueError: The parameters are of another config.
     """
-    if config.crop.upright:
-        raise ValueError(
-            f"the model ({origin}) was trained on crops rolled until hands stand upright, and "
-            "crops of a capture are not rolled: take a model whose `crop.upright` is False"
-        )
     return Network(config, prepare(params, config), origin)
 
 

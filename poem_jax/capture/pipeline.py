@@ -108,7 +108,7 @@ def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Netwo
     config = network.config
     frames = clock.timed("judge_boxes", judge_boxes(frames, take.rig))
     frames = clock.timed("read", read_images(frames, take.rig, go_on=take.num_frames != 1))
-    frames = clock.timed("crop", crop_hands(frames, take.rig, config.crop.ratio, config.image_hw))
+    frames = clock.timed("crop", crop_hands(frames, take.rig, config.crop, config.image_hw))
     return clock.timed("predict", predict_hands(frames, take, network))
 
 

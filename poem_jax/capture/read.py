@@ -51,12 +51,17 @@ def read_images(
         yield with_odd_images_told(frame, rig) if needed else frame
 
 
+def image_of_camera(path: Path, rig: Rig, view: int) -> UInt8[Array, "h w 3"]:
+    """Read an image of the size for which the camera was calibrated; errors as `read_image`."""
+    width, height = rig.size_wh[view]
+    return read_image(path, (int(width), int(height)))
+
+
 def _read_view(
     path: Path | None, rig: Rig, view: int, frame: str, needed: bool
 ) -> UInt8[Array, "h w 3"] | None:
     if path is not None:
-        width, height = rig.size_wh[view]
-        return read_image(path, (int(width), int(height)))
+        return image_of_camera(path, rig, view)
     if not needed:
         return None
     camera = rig.names[view]

@@ -83,9 +83,17 @@ def read_take(
         raise FileNotFoundError(f"no capture folder at {folder}")
     found = find_rig(folder, rig)
     paths = find_frames(folder, found.names)
-    boxes_file = _given_or_found(boxes, folder, BOXES_FILES, HOW_TO_GET_BOXES)
+    boxes_file = boxes_beside(folder) if boxes is None else Path(boxes)
+    if boxes_file is None:
+        looked = " or ".join(str(folder / name) for name in BOXES_FILES)
+        raise FileNotFoundError(f"no {looked}: {HOW_TO_GET_BOXES}")
     names = [frame.name for frame in paths]
     return make_take(found, paths, align_boxes(read_boxes(boxes_file), names, found.names, boxes_file))
+
+
+def boxes_beside(folder: Path) -> Path | None:
+    """Return the file of boxes in a capture's folder, None where there is none."""
+    return next((folder / name for name in BOXES_FILES if (folder / name).is_file()), None)
 
 
 def read_keypoint_take(
@@ -179,15 +187,3 @@ def _frame_names(count: int, pictures: list[FramePaths]) -> tuple[str, ...]:
     if len(pictures) == count:
         return tuple(frame.name for frame in pictures)
     return tuple(f"{index:04d}" for index in range(count))
-
-
-def _given_or_found(
-    given: str | os.PathLike | None, folder: Path, candidates: tuple[str, ...], help_text: str
-) -> Path:
-    if given is not None:
-        return Path(given)
-    found = next((folder / name for name in candidates if (folder / name).is_file()), None)
-    if found is None:
-        looked = " or ".join(str(folder / name) for name in candidates)
-        raise FileNotFoundError(f"no {looked}: {help_text}")
-    return found

@@ -1,15 +1,19 @@
-"""`poem detect`."""
+"""`poem detect`, and the search for hands before `reconstruct` and `fit`."""
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from poem_jax.cli.messages import say, tells_what_is_left
 from poem_jax.cli.options import File, Flag, OptionalFile, PositionalFolder
 
+FOUND_FILE = "keypoints.npz"
+"""What `reconstruct` and `fit` call the key points that they find."""
+
 
 @dataclass(frozen=True)
 class Detect:
-    """Find both hands in the images of a capture with MediaPipe and write their 2D key points."""
+    """Find the hands in the images of a capture and write their 2D key points."""
 
     folder: PositionalFolder
     """The capture, as for `reconstruct`."""
@@ -17,28 +21,46 @@ class Detect:
     """The key-point file (npz) to write, for `fit` or for `reconstruct --boxes`."""
     rig: OptionalFile = None
     """Calibration; without it rig.json or calibration/rig.json in DIR."""
+    max_hands: int = 2
+    """Hands in the take, of one person or of several."""
+    video: Flag = False
+    """The frames follow each other as those of a video: look where the hands were in the frame before."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
     def run(self) -> None:
         """Write the file and print what was found."""
-        import numpy as np
-
-        from poem_jax.capture.boxes_file import write_boxes
-        from poem_jax.capture.detect import detect_hands
-        from poem_jax.capture.folder import RIG_FILES, find_frames, find_rig
-        from poem_jax.io.writable import check_file_is_writable, check_inputs_stay
+        from poem_jax.io.writable import check_file_is_writable
 
         check_file_is_writable(self.out)
-        rig = find_rig(self.folder, self.rig)
-        frames = find_frames(self.folder, rig.names)
-        images = [image for frame in frames for image in frame.images]
-        check_inputs_stay([self.out], [self.rig, *(self.folder / name for name in RIG_FILES), *images])
-        say(f"looking for hands in {len(frames)} frames of {rig.num_views} cameras")
-        with tells_what_is_left(self.out):
-            hands = detect_hands(frames, rig, when_stopped=partial(write_boxes, self.out))
-            write_boxes(self.out, hands)
-        views = np.isfinite(hands.boxes_px).all(-1).sum(2)
-        for side, count in zip(hands.hand_side, views.T, strict=True):
-            print(f"{side} hand: seen by two views or more in {(count > 1).sum()} of {len(count)} frames")
+        find_keypoints(self.folder, self.out, self.rig, self.max_hands, self.video)
         print(f"written to {self.out}")
+
+
+def find_keypoints(
+    folder: Path, out: Path, rig_file: Path | None, max_hands: int = 2, video: bool = False
+) -> None:
+    """Write the key points of a capture to the file `out`, and print what was found."""
+    import numpy as np
+
+    from poem_jax.capture.boxes_file import write_boxes
+    from poem_jax.capture.detect import detect_hands
+    from poem_jax.capture.folder import RIG_FILES, find_frames, find_rig
+    from poem_jax.capture.take import hand_names
+    from poem_jax.io.writable import check_inputs_stay
+
+    if max_hands < 1:
+        raise ValueError(f"--max-hands must be 1 or more; got {max_hands}")
+    rig = find_rig(folder, rig_file)
+    frames = find_frames(folder, rig.names)
+    images = [image for frame in frames for image in frame.images]
+    check_inputs_stay([out], [rig_file, *(folder / name for name in RIG_FILES), *images])
+    say(f"looking for hands in {len(frames)} frames of {rig.num_views} cameras")
+    with tells_what_is_left(out):
+        hands = detect_hands(
+            frames, rig, max_hands=max_hands, video=video, when_stopped=partial(write_boxes, out)
+        )
+        write_boxes(out, hands)
+    views = np.isfinite(hands.boxes_px).all(-1).sum(2)
+    for name, count in zip(hand_names(hands.hand_side), views.T, strict=True):
+        print(f"{name} hand: seen by two views or more in {(count > 1).sum()} of {len(count)} frames")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from poem_jax.cli.detect import FOUND_FILE, find_keypoints
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder
 
@@ -15,20 +16,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fit:
-    """Fit hands to 2D key points from several calibrated cameras; no network, no images needed.
+    """Fit hands to 2D key points from several calibrated cameras: no images are needed.
 
+    Given a capture's folder instead, the key points are found in its images first, as by `poem detect`.
     Writes what `reconstruct` writes, with pose, shape and place of the hand model, and the uncertainty of
     every joint; see docs/fitting.md.
     """
 
-    keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
-    """Key points (npz); see docs/captures.md."""
+    keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS|DIR")]
+    """Key points (npz), or the folder of a capture; see docs/captures.md."""
     out: Folder
     """Folder for the results; files of the same name are replaced."""
     rig: OptionalFile = None
     """Calibration; without it rig.json or calibration/rig.json in the folder of --images or of KEYPOINTS."""
+    max_hands: int = 2
+    """Hands that are looked for in a capture's images."""
+    video: Flag = False
+    """As for `poem detect`."""
     images: OptionalFolder = None
-    """Capture folder with the images to draw on."""
+    """Capture folder with the images to draw on; that which is given as DIR."""
     mano: OptionalFile = None
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
@@ -47,7 +53,11 @@ class Fit:
 
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
-        take = read_keypoint_take(self.keypoints, self.rig, self.images)
+        keypoints, images = self.keypoints, self.images
+        if keypoints.is_dir():
+            images, keypoints = images or keypoints, self.out / FOUND_FILE
+            find_keypoints(self.keypoints, keypoints, self.rig, self.max_hands, self.video)
+        take = read_keypoint_take(keypoints, self.rig, images)
         hand = hand_from(self.mano)
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):

@@ -1,8 +1,10 @@
 """`poem reconstruct`."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from poem_jax.cli.detect import FOUND_FILE, find_keypoints
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
 
@@ -15,7 +17,7 @@ class Reconstruct:
     """Reconstruct the hands of a capture: meshes, overlays, a 3D page, arrays and a report.
 
     DIR holds one image per camera, <camera>.jpg or .png, or frames/<frame>/<camera>.jpg for a take. Boxes or
-    2D key points say where the hands are in each view; see docs/captures.md.
+    2D key points may say where the hands are in each view, else they are looked for; see docs/captures.md.
     """
 
     folder: PositionalFolder
@@ -25,7 +27,11 @@ class Reconstruct:
     rig: OptionalFile = None
     """Calibration; without it rig.json or calibration/rig.json in DIR."""
     boxes: OptionalFile = None
-    """Boxes or key points (npz); without it boxes.npz in DIR."""
+    """Boxes or key points (npz); without it boxes.npz in DIR, or what the detector finds."""
+    max_hands: int = 2
+    """Hands that are looked for where neither boxes nor key points are given."""
+    video: Flag = False
+    """As for `poem detect`."""
     checkpoint: OptionalFolder = None
     """Model folder that poem_jax.save wrote; without it the shipped weights."""
     engine: Literal["network", "fit"] = "network"
@@ -41,6 +47,7 @@ class Reconstruct:
 
     def run(self) -> None:
         """Write the results and print where they are."""
+        from poem_jax.capture.take import boxes_beside
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
@@ -50,25 +57,31 @@ class Reconstruct:
             raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
+        boxes = self.boxes or boxes_beside(self.folder) or self._find()
         with tells_what_is_left(self.out):
-            written = self._fit() if self.engine == "fit" else self._reconstruct()
+            written = self._fit(boxes) if self.engine == "fit" else self._reconstruct(boxes)
         print_files(written, self.out)
         print_summary(written.report)
 
-    def _reconstruct(self) -> "Written":
+    def _find(self) -> Path:
+        boxes = self.out / FOUND_FILE
+        find_keypoints(self.folder, boxes, self.rig, self.max_hands, self.video)
+        return boxes
+
+    def _reconstruct(self, boxes: Path) -> "Written":
         from poem_jax.capture.pipeline import reconstruct
         from poem_jax.capture.take import read_take
 
-        take = read_take(self.folder, self.rig, self.boxes)
+        take = read_take(self.folder, self.rig, boxes)
         say(f"{take.num_frames} frames; the first run on a machine compiles the model, once")
         return reconstruct(take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None)
 
-    def _fit(self) -> "Written":
+    def _fit(self, boxes: Path) -> "Written":
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
         from poem_jax.cli.fit import hand_from
 
-        take = read_take(self.folder, self.rig, self.boxes)
+        take = read_take(self.folder, self.rig, boxes)
         hand = hand_from(self.mano)
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         return fit(take, self.out, hand=hand, smooth=self.smooth, meshes=self.meshes or None)

@@ -8,6 +8,8 @@ from poem_jax.capture.crop import crop_hands, hand_squares
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.lens import project_raw
 from poem_jax.geometry.cameras import project
+from poem_jax.hand.topology import ROOT_JOINT, WRIST
+from poem_jax.models.config import CropConfig
 
 HW = (64, 64)
 
@@ -22,8 +24,9 @@ def frame(rig):
     return Frame("0", boxes[None], uv[None], images=images, hands=(HandResult(np.zeros(3, bool)),)), joints
 
 
-def crops_of(frame, rig, ratio=1.5):
-    (done,) = crop_hands([frame._replace(squares_px=hand_squares(frame, rig))], rig, ratio, HW)
+def crops_of(frame, rig, ratio=1.5, upright=False):
+    crop = CropConfig(ratio, upright)
+    (done,) = crop_hands([frame._replace(squares_px=hand_squares(frame, rig))], rig, crop, HW)
     return done.crops[0]
 
 
@@ -36,6 +39,56 @@ def test_a_crop_is_the_square_about_the_joints_times_the_ratio(frame, rig, ratio
         low, high = uv.min(0), uv.max(0)
         assert (high - low).max() == pytest.approx(64 / ratio, abs=0.02)
         np.testing.assert_allclose((low + high) / 2, 32, atol=0.02)
+
+
+def test_upright_crops_show_the_knuckle_above_the_wrist(frame, rig):
+    frame, joints = frame
+    crops = crops_of(frame, rig, 1.5, upright=True)
+    level = crops_of(frame, rig, 1.5)
+    assert crops.view_mask.all()
+    for view in range(3):
+        T = crops.T_cam_from_world[view].astype(float)
+        uv, depth = project(crops.K[view].astype(float), T, joints)
+        up = uv[ROOT_JOINT] - uv[WRIST]
+        assert up[1] < 0
+        assert abs(up[0]) < 3e-3 * -up[1]
+        assert np.ptp(uv, axis=0).max() == pytest.approx(64 / 1.5, abs=0.02)
+        np.testing.assert_allclose((uv.min(0) + uv.max(0)) / 2, 32, atol=0.02)
+        before = project(level.K[view].astype(float), level.T_cam_from_world[view].astype(float), joints)[1]
+        np.testing.assert_allclose(depth, before, atol=1e-6)
+
+
+def test_upright_pictures_turn_with_their_cameras(frame, rig):
+    """Every joint in turn is a bright spot in the photograph, and lies where the crop's camera sees it."""
+    frame, joints = frame
+    for joint in (WRIST, ROOT_JOINT, 20):
+        images = []
+        for view in range(3):
+            image = np.zeros((180, 240, 3), np.uint8)
+            at = np.round(frame.keypoints_px[0, view, joint] * 16 - 8).astype(int)
+            images.append(cv2.circle(image, at.tolist(), 5 * 16, (255,) * 3, -1, cv2.LINE_AA, 4))
+        crops = crops_of(frame._replace(images=tuple(images)), rig, 2.0, upright=True)
+        for view in range(3):
+            grey = crops.views[view, ..., 0].astype(float)
+            rows, columns = np.mgrid[:64, :64] + 0.5
+            middle = np.array([(grey * columns).sum(), (grey * rows).sum()]) / grey.sum()
+            T = crops.T_cam_from_world[view].astype(float)
+            expected = project(crops.K[view].astype(float), T, joints[joint : joint + 1])[0][0]
+            np.testing.assert_allclose(middle, expected, atol=0.4)
+
+
+def test_a_view_that_does_not_see_the_palm_has_no_upright_crop(frame, rig):
+    frame, _ = frame
+    keypoints = frame.keypoints_px.copy()
+    keypoints[0, 1, WRIST] = np.nan
+    crops = crops_of(frame._replace(keypoints_px=keypoints), rig, upright=True)
+    assert crops.view_mask.tolist() == [True, False, True]
+
+
+def test_boxes_alone_do_not_tell_which_way_is_up(frame, rig):
+    frame, _ = frame
+    with pytest.raises(ValueError, match="trained on upright hands"):
+        crops_of(frame._replace(keypoints_px=None), rig, upright=True)
 
 
 def test_a_view_without_box_or_image_is_masked(frame, rig):

@@ -99,16 +99,18 @@ def test_inconsistent_cameras_are_named(data, tmp_path):
     assert np.isfinite(written.arrays["joints_world"][written.arrays["valid"]]).all()
 
 
-@pytest.mark.filterwarnings("ignore:SymbolDatabase.GetPrototype:UserWarning")
-@pytest.mark.parametrize("folder", ["caliscope_4cam_hands", "caliscope_4cam_board"])
-def test_images_alone_give_the_same_hands(data, tmp_path, folder):
-    """MediaPipe on the images, then the fit: within 3 mm of the fit to the stored key points."""
-    pytest.importorskip("mediapipe", reason="the extra `detect` is not installed")
+@pytest.mark.parametrize(
+    ("folder", "most_mm"), [("caliscope_4cam_hands", 1.0), ("caliscope_4cam_board", 1.5)]
+)
+def test_images_alone_give_the_same_hands(data, tmp_path, folder, most_mm):
+    """Detection and association, then the fit, against the fit to the stored key points."""
     stored = np.load(data / folder / "pseudo_gt.npz")
     keypoints, _, frames = tracks(stored)
     found_rig = read_rig(data / folder / "calibration" / "rig.json")
     hands = detect_hands(find_frames(data / folder, found_rig.names), found_rig, progress=False)
     assert hands.frames is not None
+    assert hands.hand_side == SIDES
+    assert np.isfinite(hands.boxes_px).all()
     order = [hands.frames.index(name) for name in sorted(hands.frames)]
     assert [int(hands.frames[index]) for index in order] == [int(frame) for frame in frames]
     results = [
@@ -123,4 +125,4 @@ def test_images_alone_give_the_same_hands(data, tmp_path, folder):
     one, other = (result.arrays["joints_world"] for result in results)
     apart = 1000 * np.median(np.linalg.norm(one - other, axis=-1))
     print(f"{apart:.2f} mm apart")
-    assert apart <= 3
+    assert apart <= most_mm

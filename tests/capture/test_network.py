@@ -1,14 +1,11 @@
 """Hands by a network: left hands as mirrored right ones, batches, and hands that cannot be predicted."""
 
-import dataclasses
-
 import numpy as np
-import pytest
 
 from poem_jax.batch import Prediction
 from poem_jax.capture.crop import crop_hands, hand_squares
 from poem_jax.capture.frame import HandCrops, HandResult
-from poem_jax.capture.network import MAX_BATCH, UNDETERMINED, Network, make_network, predict_hands
+from poem_jax.capture.network import MAX_BATCH, UNDETERMINED, Network, predict_hands
 from poem_jax.capture.pipeline import by_network
 from poem_jax.capture.read import read_images
 from poem_jax.capture.report import Clock
@@ -33,7 +30,7 @@ def cropped(capture, sides=None):
         )
         for frame in take.frames
     )
-    return take, list(crop_hands(read_images(frames, take.rig), take.rig, 1.5, HW))
+    return take, list(crop_hands(read_images(frames, take.rig), take.rig, CropConfig(1.5), HW))
 
 
 class Recorder:
@@ -159,10 +156,3 @@ def test_crops_are_as_wide_as_the_model_was_trained_with(make_capture):
         fed.append(model.fed[0][1].K[0])
     np.testing.assert_allclose(fed[0][:, 0, 0], 2 * fed[1][:, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(fed[0][:, :2, 2] - 32, 2 * (fed[1][:, :2, 2] - 32), atol=1e-3)
-
-
-def test_a_model_of_upright_crops_is_refused(micro_model):
-    """It would be fed others, and give wrong hands without a word."""
-    config, params = micro_model
-    with pytest.raises(ValueError, match="upright"):
-        make_network(dataclasses.replace(config, crop=CropConfig(upright=True)), params)
