@@ -216,6 +216,7 @@ def test_the_parametric_model_is_imported(tmp_path, small_presets):
     assert_same_bits(poem_jax.load(tmp_path / "out")[1], release.converted(config, "v2-medium-mano"))
 
 
+@pytest.mark.slow
 def test_a_whole_model_is_imported(tmp_path, capsys):
     config = PRESETS["v2-small-release"]
     release = write_release(tmp_path, config)

@@ -266,7 +266,8 @@ def test_shares_of_uneven_shards_add_up():
         jnp.arange(8.0).reshape(4, 2),
         jnp.array([[True, True], [True, False], [False] * 2, [True] * 2]),
     )
-    shares = jax.pmap(lambda v, m: masked_mean(v, m, axis_name="x"), axis_name="x")(values, mask)
+    shards = (values.reshape(2, 2, 2), mask.reshape(2, 2, 2))
+    shares = jax.pmap(lambda v, m: masked_mean(v, m, axis_name="x"), axis_name="x")(*shards)
     np.testing.assert_allclose(shares.sum(), masked_mean(values, mask), rtol=1e-6)
 
 

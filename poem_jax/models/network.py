@@ -346,9 +346,21 @@ def check_params(config: Config, params: Params) -> None:
     )
 
 
+class _SameKey(nnx.Rngs):
+    """For weights of which only the shapes are wanted: under a trace Flax takes seconds to count keys."""
+
+    def __init__(self, key: Array) -> None:
+        super().__init__(0)
+        self._key = key
+
+    def params(self) -> Array:
+        """Return the key."""
+        return self._key
+
+
 @functools.lru_cache(maxsize=32)
 def _blueprint(config: Config) -> _Blueprint:
-    abstract = nnx.eval_shape(lambda: build(config, nnx.Rngs(0)))
+    abstract = nnx.eval_shape(lambda key: build(config, _SameKey(key)), jax.random.key(0))
     graph, *states = nnx.split(abstract, *GROUPS.values())
     return _Blueprint(graph, {g: dict(nnx.to_flat_state(s)) for g, s in zip(GROUPS, states, strict=True)})
 

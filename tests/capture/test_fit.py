@@ -358,6 +358,7 @@ def longer(take: Take, count: int) -> Take:
     return with_keypoints(take.rig, np.resize(keypoints, (count, *keypoints.shape[1:])))
 
 
+@pytest.mark.slow
 def test_takes_of_any_length_share_compiled_programs(take, tmp_path, compilations):
     """A take of more than one group compiles all that there is."""
     fit(longer(take, FRAMES_TOGETHER + 2), tmp_path / "more", progress=False)
@@ -367,6 +368,7 @@ def test_takes_of_any_length_share_compiled_programs(take, tmp_path, compilation
     assert len(compilations) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [False, True])
 def test_a_long_take_is_fitted_group_by_group_with_one_shape(take, tmp_path, truth, smooth):
     count = 2 * FRAMES_TOGETHER + 9

@@ -58,6 +58,7 @@ def frames_of(path):
         return stored["frames"].tolist()
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_take(make_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(page_pictures, "PAGE_FRAMES", 2)
     monkeypatch.setattr(agreement, "_WINDOW", 8)

@@ -139,6 +139,7 @@ def test_the_rates_are_halved_after_the_patience(model, takes):
     np.testing.assert_array_equal(halved, [52, 103])
 
 
+@pytest.mark.slow
 def test_the_papers_recipe_lowers_the_error(model, takes):
     """From the flat hand, and further from where a hand already lies close."""
     take = takes(2, 4, 0.0, 2)
@@ -155,6 +156,7 @@ def test_the_papers_recipe_lowers_the_error(model, takes):
         assert 1000 * np.linalg.norm(result.joints - take.joints, axis=-1).mean() < max_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loss", [silhouette_cross_entropy, pytest.param(silhouette_l1, marks=pytest.mark.slow)]
 )

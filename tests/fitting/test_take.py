@@ -306,6 +306,7 @@ def test_the_second_pass_survives_unrelated_frames_and_a_wild_one(model, takes):
     assert np.median(error_mm(smooth, take)[others]) < 1.1 * np.median(error_mm(plain, take)[others])
 
 
+@pytest.mark.slow
 def test_the_second_pass_never_raises_the_cost(model, takes):
     """Also where its model is wrong: unrelated poses, held together as if they were one at rest."""
     take = takes(4, 4, 1.0, 13)
@@ -392,6 +393,7 @@ def test_a_world_far_from_its_origin_gives_the_same_hand(model, takes, origin):
         fit_take(model, weighted(take)._replace(T_cam_from_world=far.astype(np.float32)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("origin", [[50e3, 20e3, 100.0]])
 def test_a_far_world_moves_start_and_silhouettes_of_the_iterative_fit(model, takes, origin):
     take, origin = takes(1, 2, 0.0, 13), np.asarray(origin)

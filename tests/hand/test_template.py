@@ -198,6 +198,7 @@ def test_poses_of_random_shapes_do_not_run_into_themselves(measures, rng, count)
     assert _crossing_share(measures, pose, rng.standard_normal((count, 10))) <= 0.05
 
 
+@pytest.mark.slow
 def test_the_script_makes_the_shipped_file(tmp_path):
     """About ten seconds: the price of knowing that the shipped arrays are what the script says."""
     out = tmp_path / "template.npz"

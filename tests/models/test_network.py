@@ -249,6 +249,7 @@ def _as64(x):
     return jnp.asarray(x, jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else jnp.asarray(x)
 
 
+@pytest.mark.slow
 def test_gradients_of_cameras_and_root_match_finite_differences(loss64):
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):

@@ -201,6 +201,7 @@ def test_paper_parametric(compare, parametric_config):
     assert max(compare(parametric_config)) < LARGEST_M
 
 
+@pytest.mark.slow
 def test_release(compare, micro_config):
     assert max(compare(_like_release(micro_config))) < LARGEST_M
 
@@ -211,6 +212,7 @@ def test_release_parametric_of_one_view(compare, micro_config):
     assert max(compare(config, views=1)) < LARGEST_M
 
 
+@pytest.mark.slow
 def test_tiny(compare, micro_config):
     """Its queries start at triangulated joints, which also give the root."""
     unknown = (np.nan, np.nan, np.nan)

@@ -36,6 +36,7 @@ def two_devices(monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda *_: devices)
 
 
+@pytest.mark.slow
 def test_two_and_two_steps_equal_four(micro_config, batch_at, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     whole = train(micro_config, batch_at=batch_at)
@@ -184,6 +185,7 @@ def test_errors_of_the_source_arrive(micro_config):
         train(micro_config, batch_at=broken)
 
 
+@pytest.mark.slow
 def test_validation_and_jit_sharding_run(micro_config, batch_at):
     config = with_run(
         micro_config,

@@ -97,7 +97,7 @@ def test_eight_devices():
     """The tests of a split over devices, of which the suite has two, in a process that has eight."""
     devices = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "PJRT_NPROC": "12"}
     ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-n", "0", "-k", "split or belongs", __file__],
+        [sys.executable, "-m", "pytest", "-n", "0", "-m", "", "-k", "split or belongs", __file__],
         env=os.environ | devices,
         cwd=Path(__file__).parents[2],
         capture_output=True,
@@ -107,6 +107,7 @@ def test_eight_devices():
     assert "2 passed" in ran.stdout, ran.stdout + ran.stderr
 
 
+@pytest.mark.slow
 def test_any_split_over_devices_gives_the_result_of_one(drawn_params, config, micro_batch):
     count = jax.device_count()
     assert count > 1
