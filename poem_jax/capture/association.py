@@ -16,6 +16,7 @@ from poem_jax.capture.hand_matching import match_views
 from poem_jax.capture.hand_tracks import Track, follow_hands
 from poem_jax.capture.lone_detections import join_lone_detections
 from poem_jax.capture.sightings import NONE, Sightings, sightings_of_frames, vote_for_right
+from poem_jax.capture.take import hand_names
 from poem_jax.detection import DetectedHand
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.world_origin import distant_origin, move_origin
@@ -40,7 +41,11 @@ _Found = Int[Array, "hand frame view"]
 
 
 def associate_hands(
-    detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig, *, max_hands: int = 2
+    detections: Sequence[Sequence[Sequence[DetectedHand]]],
+    rig: Rig,
+    *,
+    max_hands: int = 2,
+    frame_names: Sequence[str] | None = None,
 ) -> AssociatedHands:
     """Find which detections are the same hand in all views and frames, and of which side each hand is.
 
@@ -51,6 +56,7 @@ def associate_hands(
         detections: By frame, view (in the rig's order) and hand found; pixels of the raw images.
         rig: The cameras.
         max_hands: Hands returned at most, those followed best: 2 for one person.
+        frame_names: By which warnings call the frames; None = their numbers from 0.
 
     Returns: see `AssociatedHands`. A second detection of one hand in one view, and what fits no hand, is left
         out.
@@ -60,16 +66,17 @@ def associate_hands(
             agree on any hand.
     """
     _check(detections, rig, max_hands)
+    called = [str(i) for i in range(len(detections))] if frame_names is None else frame_names
     seeing = {view for views in detections for view, found in enumerate(views) if found}
     if len(seeing) == 1:
-        return _by_side_alone(detections, rig, seeing.pop(), max_hands)
+        return _by_side_alone(detections, rig, seeing.pop(), max_hands, called)
     near = move_origin(rig.T_cam_from_world, distant_origin(rig.T_cam_from_world))
     frames = sightings_of_frames(detections, rig._replace(T_cam_from_world=near))
     followed = follow_hands([match_views(frame, max_hands) for frame in frames])
     if not followed.tracks:
         raise ValueError(
             f"no two of the cameras {', '.join(rig.names)} agree on a hand in any frame, though hands were "
-            "found; check the rig (`poem calibration`), that frames are synchronous and views in its order"
+            "found; check the rig, that frames are synchronous and views in its order"
         )
     kept = kept_tracks(followed.tracks, max_hands)
     # Hands that are not kept hold their detections too, so that nobody else takes them.
@@ -79,16 +86,16 @@ def associate_hands(
     found = every[[trusted.index(i) for i in kept]]
     sides, of_sides = name_sides(_votes(frames, found))
     order = sorted(range(len(kept)), key=lambda i: (SIDES.index(sides[i]), -(found[i] != NONE).sum()))
-    names = words.names([sides[i] for i in order])
+    names = hand_names(tuple(sides[i] for i in order))
     named = {kept[i]: name for i, name in zip(order, names, strict=True)}
     warnings = [
         *(message.format(*(names[order.index(i)] for i in hands)) for message, hands in of_sides),
-        *words.unsure_matches(followed, named, rig),
-        *words.unsure_tracks(followed, named),
-        *words.suspicious_jumps(followed, named),
-        *words.others(followed.tracks, kept, max_hands),
-        *words.doubtful_lone(doubtful, rig),
-        *words.unconfirmed(frames, every, followed.tracks, rig),
+        *words.unsure_matches(followed, named, rig, called),
+        *words.unsure_tracks(followed, named, called),
+        *words.suspicious_jumps(followed, named, called),
+        *words.others(followed.tracks, kept, max_hands, called),
+        *words.doubtful_lone(doubtful, rig, called),
+        *words.unconfirmed(frames, every, followed.tracks, rig, called),
     ]
     keypoints, scores = _entries(detections, frames, found[order])
     return AssociatedHands(keypoints, scores, tuple(sides[i] for i in order), tuple(warnings))
@@ -142,7 +149,11 @@ def _entries(
 
 
 def _by_side_alone(
-    detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig, view: int, max_hands: int
+    detections: Sequence[Sequence[Sequence[DetectedHand]]],
+    rig: Rig,
+    view: int,
+    max_hands: int,
+    called: Sequence[str],
 ) -> AssociatedHands:
     """Return the surest right and the surest left hand of every frame of the only camera that sees any."""
     keypoints = np.full((len(detections), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
@@ -163,7 +174,7 @@ def _by_side_alone(
     if left_out:
         warnings.append(
             f"camera {rig.names[view]} sees several hands of one side in "
-            f"{words.listed(sorted(set(left_out)))}; the surest was kept: check these images"
+            f"{words.listed(sorted(set(left_out)), called)}; the surest was kept: check these images"
         )
     return AssociatedHands(
         keypoints[:, used], scores[:, used], tuple(SIDES[i] for i in used), tuple(warnings)

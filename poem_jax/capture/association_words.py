@@ -1,4 +1,7 @@
-"""What is said of an association that is not sure: what, where, and what to do."""
+"""What is said of an association that is not sure: what, where, and what to do.
+
+`called` are the names of the frames.
+"""
 
 from collections.abc import Sequence
 
@@ -14,15 +17,7 @@ from poem_jax.typing import Array, Bool, Int
 _MOST_NAMED = 5
 
 
-def names(sides: Sequence[str]) -> list[str]:
-    """Return the sides, numbered where several hands have one."""
-    return [
-        side if sides.count(side) == 1 else f"{side} (number {sides[: i + 1].count(side)})"
-        for i, side in enumerate(sides)
-    ]
-
-
-def unsure_matches(followed: Tracks, named: dict[int, str], rig: Rig) -> list[str]:
+def unsure_matches(followed: Tracks, named: dict[int, str], rig: Rig, called: Sequence[str]) -> list[str]:
     """Name the views of which another detection fits a hand as well."""
     places: dict[tuple[str, int], list[int]] = {}
     for number, name in named.items():
@@ -30,43 +25,43 @@ def unsure_matches(followed: Tracks, named: dict[int, str], rig: Rig) -> list[st
             for view in hand.unsure_views:
                 places.setdefault((name, view), []).append(frame)
     return [
-        f"camera {rig.names[view]} may show another hand as the {name} one in {listed(frames)}: its rays fit "
-        "badly, or those of both hands fit equally well; check these images"
+        f"camera {rig.names[view]} may show another hand as the {name} one in {listed(frames, called)}: its "
+        "rays fit badly, or those of both hands fit equally well; check these images"
         for (name, view), frames in sorted(places.items())
     ]
 
 
-def unsure_tracks(followed: Tracks, named: dict[int, str]) -> list[str]:
+def unsure_tracks(followed: Tracks, named: dict[int, str], called: Sequence[str]) -> list[str]:
     """Name the frames from which on hands could be exchanged."""
     told = []
     for frame, *pair in followed.unsure:
         hands = sorted({named[i] for i in pair if i in named})
         if hands:
             told.append(
-                f"hands may be exchanged from frame {frame} on ({' and '.join(hands)}): place, motion and "
-                "sides fit another way nearly as well; check the images before and after"
+                f"hands may be exchanged from frame {called[frame]} on ({' and '.join(hands)}): place, "
+                "motion and sides fit another way nearly as well; check the images before and after"
             )
     return told
 
 
-def suspicious_jumps(followed: Tracks, named: dict[int, str]) -> list[str]:
+def suspicious_jumps(followed: Tracks, named: dict[int, str], called: Sequence[str]) -> list[str]:
     """Name the hands that go on elsewhere, where several people's hands may be mixed up."""
     rights = [track.vote > 0 for track in followed.tracks]
     return [
-        f"the {named[i]} hand goes on far from where it was in frame {frame}, and other {side} hands are "
-        "there: it could be another person's from then on; check the images before and after"
+        f"the {named[i]} hand goes on far from where it was in frame {called[frame]}, and other {side} hands "
+        "are there: it could be another person's from then on; check the images before and after"
         for frame, i in followed.jumps
         if i in named and rights.count(rights[i]) > 1
         for side in (SIDES[0] if rights[i] else SIDES[1],)
     ]
 
 
-def others(tracks: Sequence[Track], kept: Sequence[int], max_hands: int) -> list[str]:
+def others(tracks: Sequence[Track], kept: Sequence[int], max_hands: int, called: Sequence[str]) -> list[str]:
     """Tell of what was followed and is not kept."""
     rest = [track for i, track in enumerate(tracks) if i not in kept]
     if not rest:
         return []
-    frames = listed(sorted({frame for track in rest for frame in track.hands}))
+    frames = listed(sorted({frame for track in rest for frame in track.hands}), called)
     if len(kept) < max_hands:
         return [
             f"something like one more hand was seen in {frames}, too short a time to be trusted, and left "
@@ -79,18 +74,22 @@ def others(tracks: Sequence[Track], kept: Sequence[int], max_hands: int) -> list
     ]
 
 
-def doubtful_lone(doubtful: Sequence[tuple[int, int]], rig: Rig) -> list[str]:
+def doubtful_lone(doubtful: Sequence[tuple[int, int]], rig: Rig, called: Sequence[str]) -> list[str]:
     """Name the detections of one view that could be of either of two hands."""
     return [
-        f"camera {rig.names[view]} alone sees a hand in {listed(frames)} that could be either of two; it is "
-        "left out there: check these images"
+        f"camera {rig.names[view]} alone sees a hand in {listed(frames, called)} that could be either of "
+        "two: it is left out there: check these images"
         for view in sorted({view for _, view in doubtful})
         for frames in ([frame for frame, seen_by in doubtful if seen_by == view],)
     ]
 
 
 def unconfirmed(
-    frames: Sequence[Sightings], found: Int[Array, "hand frame view"], tracks: Sequence[Track], rig: Rig
+    frames: Sequence[Sightings],
+    found: Int[Array, "hand frame view"],
+    tracks: Sequence[Track],
+    rig: Rig,
+    called: Sequence[str],
 ) -> list[str]:
     """Name the views that see what no other view confirms, second detections of a hand left out."""
     places: dict[int, list[int]] = {}
@@ -100,7 +99,9 @@ def unconfirmed(
         free = np.setdiff1d(np.arange(len(sightings.view)), used)
         for number in free[~_are_second(sightings, hands, free)]:
             places.setdefault(int(sightings.view[number]), []).append(frame)
-    told = [f"{rig.names[view]} in {listed(sorted(set(where)))}" for view, where in sorted(places.items())]
+    told = [
+        f"{rig.names[view]} in {listed(sorted(set(where)), called)}" for view, where in sorted(places.items())
+    ]
     return [
         f"what looks like a hand to one camera and has no place in space is left out ({'; '.join(told)}): "
         "look at these images if a hand is missing there"
@@ -118,9 +119,9 @@ def _are_second(
     return second
 
 
-def listed(frames: Sequence[int]) -> str:
-    """Return frames in words, the first few by number."""
-    first = ", ".join(map(str, frames[:_MOST_NAMED]))
+def listed(frames: Sequence[int], called: Sequence[str]) -> str:
+    """Return frames in words, the first few by name."""
+    first = ", ".join(called[frame] for frame in frames[:_MOST_NAMED])
     if len(frames) <= _MOST_NAMED:
         return f"frame{'s' * (len(frames) > 1)} {first}"
     return f"{len(frames)} frames ({first}, ...)"

@@ -6,7 +6,6 @@ of one hand is then decided for the whole take, by geometry (`association`).
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -15,17 +14,18 @@ from poem_jax.capture.association import AssociatedHands, associate_hands
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
 from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.read import image_of_camera
+from poem_jax.detection import DetectedHand, HandTracker, find_hands
 from poem_jax.geometry.rig import Rig
 from poem_jax.typing import Array, Float, UInt8
 
-if TYPE_CHECKING:
-    from poem_jax.detection import DetectedHand
+Detector = Callable[[Sequence[int], Sequence[UInt8[Array, "_ _ 3"]]], Sequence[Sequence[DetectedHand]]]
+"""From the numbers of some views and their images of a frame to the hands in each."""
+Found = list[Sequence[DetectedHand]]
+"""The hands in every view of a frame."""
 
-Images = Sequence[UInt8[Array, "_ _ 3"]]
-Detector = Callable[[Sequence[int], Images], "Sequence[Sequence[DetectedHand]]"]
-"""From some views' numbers and images of a frame to the hands in each."""
-
-MAX_HANDS = 2
+DETECTOR = "mediapipe-hands"
+_MORE_IN_AN_IMAGE = 2
+"""Places looked at in an image beyond the hands of the take: faces, and the hands of others."""
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ def detect_hands(
     frames: Sequence[FramePaths],
     rig: Rig,
     *,
-    max_hands: int = MAX_HANDS,
+    max_hands: int = 2,
     video: bool = False,
     detector: Detector | None = None,
     when_stopped: Callable[[HandBoxes], object] | None = None,
@@ -45,9 +45,9 @@ def detect_hands(
     Args:
         frames: From `find_frames`; images that are missing or damaged see nothing (a warning names them).
         rig: The cameras.
-        max_hands: Hands in the take, and looked for in one image.
-        video: A hand is looked for where it was in the frame before: twice as fast where frames follow each
-            other closely.
+        max_hands: Hands in the take.
+        video: A hand is looked for where it was in the frame before: faster where frames follow each other
+            closely.
         detector: Finds the hands in some views of a frame; None = `poem_jax.detection`.
         when_stopped: Called with the hands of the frames that are done, where there are any, when a signal
             stops the search; the `KeyboardInterrupt` then passes on.
@@ -57,59 +57,104 @@ def detect_hands(
         beyond the image's border.
 
     Raises:
-        ValueError: No hand was found at all.
+        ValueError: No image can be read, no hand was found, or no two cameras agree on one.
     """
-    detector = _our_detector(rig.num_views, max_hands, video) if detector is None else detector
-    found: list[list[Sequence[DetectedHand]]] = []
+    search = _Search(rig, _our_detector(rig.num_views, max_hands, video) if detector is None else detector)
+    found: list[Found] = []
     try:
         for paths in tqdm(frames, unit="frame", disable=not progress or len(frames) == 1):
-            found.append(_hands_of_frame(paths, rig, detector))
+            found.append(search.look(paths))
     except KeyboardInterrupt:
-        if when_stopped is not None and any(hands for frame in found for hands in frame):
-            when_stopped(_hand_boxes(found, frames[: len(found)], rig, max_hands))
+        if when_stopped is not None:
+            _hand_over(found, frames, rig, max_hands, when_stopped)
         raise
-    if not any(hands for frame in found for hands in frame):
-        raise ValueError(
-            f"no hand was found in any image of {len(frames)} frames; give boxes or key points instead"
-        )
+    search.report(found, len(frames))
     return _hand_boxes(found, frames, rig, max_hands)
 
 
-def _our_detector(num_views: int, max_hands: int, video: bool) -> Detector:
-    from poem_jax.detection import HandTracker, find_hands
+class _Search:
+    """Goes through the frames, and remembers what is wrong with the cameras' images."""
 
+    def __init__(self, rig: Rig, detector: Detector) -> None:
+        self._rig, self._detector = rig, detector
+        self._problems: dict[int, list[FileNotFoundError | ValueError]] = {}
+        self._images = np.zeros(rig.num_views, int)
+
+    def look(self, paths: FramePaths) -> Found:
+        """Return the hands in every view of a frame; the first lost image of a camera is told at once."""
+        images = {}
+        for view, path in enumerate(paths.images):
+            try:
+                if path is None:
+                    raise FileNotFoundError(f"there is none of camera '{self._rig.names[view]}'")
+                images[view] = image_of_camera(path, self._rig, view)
+            except (FileNotFoundError, ValueError) as error:
+                problems = self._problems.setdefault(view, [])
+                if not problems:
+                    _log.warning("frame %s: an image is left out: %s", paths.name, error)
+                problems.append(error)
+        self._images[list(images)] += 1
+        hands = self._detector(list(images), list(images.values())) if images else []
+        by_view = dict(zip(images, hands, strict=True))
+        return [by_view.get(view, ()) for view in range(self._rig.num_views)]
+
+    def report(self, found: Sequence[Found], num_frames: int) -> None:
+        """Tell which cameras were of no use; raise the first problem where none was of any."""
+        if not self._images.any():
+            raise next(iter(self._problems.values()))[0]
+        for view, problems in self._problems.items():
+            if len(problems) > 1:
+                name = self._rig.names[view]
+                _log.warning(
+                    "camera '%s': %d of %d images are left out in all", name, len(problems), num_frames
+                )
+        if not any(hands for frame in found for hands in frame):
+            raise ValueError(
+                f"no hand was found in any image of {num_frames} frames; give boxes or key points instead"
+            )
+        for view in np.flatnonzero(self._images):
+            if not any(frame[view] for frame in found):
+                _log.warning("camera '%s' shows no hand in any image: is it covered?", self._rig.names[view])
+
+
+def _our_detector(num_views: int, max_hands: int, video: bool) -> Detector:
     if not video:
-        return lambda views, images: find_hands(images, max_hands=max_hands)
+        return lambda views, images: find_hands(images, max_hands=max_hands + _MORE_IN_AN_IMAGE)
     trackers = [HandTracker(max_hands) for _ in range(num_views)]
     return lambda views, images: [
         trackers[view].find_hands(image) for view, image in zip(views, images, strict=True)
     ]
 
 
-def _hands_of_frame(paths: FramePaths, rig: Rig, detector: Detector) -> "list[Sequence[DetectedHand]]":
-    """Return the hands in every view."""
-    images = {}
-    for view, path in enumerate(paths.images):
-        try:
-            if path is not None:
-                images[view] = image_of_camera(path, rig, view)
-        except (FileNotFoundError, ValueError) as error:
-            _log.warning("frame %s: an image is left out: %s", paths.name, error)
-    hands = dict(zip(images, detector(list(images), list(images.values())), strict=True)) if images else {}
-    return [hands.get(view, ()) for view in range(rig.num_views)]
+def _hand_over(
+    found: list[Found],
+    frames: Sequence[FramePaths],
+    rig: Rig,
+    max_hands: int,
+    when_stopped: Callable[[HandBoxes], object],
+) -> None:
+    """Pass on what was found so far, if it is enough to tell hands apart."""
+    try:
+        hands = _hand_boxes(found, frames[: len(found)], rig, max_hands)
+    except ValueError as error:
+        _log.warning("nothing is written of the frames that were searched: %s", error)
+        return
+    when_stopped(hands)
 
 
-def _hand_boxes(found: Any, frames: Sequence[FramePaths], rig: Rig, max_hands: int) -> HandBoxes:
-    hands = associate_hands(found, rig, max_hands=max_hands)
+def _hand_boxes(found: list[Found], frames: Sequence[FramePaths], rig: Rig, max_hands: int) -> HandBoxes:
+    names = tuple(frame.name for frame in frames)
+    hands = associate_hands(found, rig, max_hands=max_hands, frame_names=names)
     for warning in hands.warnings:
         _log.warning("%s", warning)
     keypoints = _within(hands.keypoints_px, rig)
-    names = tuple(frame.name for frame in frames)
     boxes = boxes_from_keypoints(keypoints)
     return HandBoxes(boxes, hands.hand_side, names, keypoints, _confidence(hands), rig.names)
 
 
-def _within(keypoints_px: Float[Array, "frame hand view 21 2"], rig: Rig) -> Array:
+def _within(
+    keypoints_px: Float[Array, "frame hand view 21 2"], rig: Rig
+) -> Float[Array, "frame hand view 21 2"]:
     """Return the key points with guesses beyond the image's border unseen."""
     inside = (keypoints_px >= 0) & (keypoints_px <= rig.size_wh[:, None])
     return np.where(inside.all(-1, keepdims=True), keypoints_px, np.nan)

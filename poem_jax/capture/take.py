@@ -20,7 +20,7 @@ from poem_jax.capture.frame import Frame
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import safe_file_names
 
-BOXES_FILES = ("boxes.npz",)
+BOXES_FILES = ("boxes.npz", "keypoints.npz")
 
 _log = logging.getLogger(__name__)
 

@@ -37,6 +37,20 @@ class Detect:
         print(f"written to {self.out}")
 
 
+def where_hands_are(folder: Path, out: Path, rig: Path | None, max_hands: int, video: bool) -> Path:
+    """Return the capture's own file of boxes or key points; else find these, and write them to `out`."""
+    from poem_jax.capture.take import boxes_beside
+
+    if max_hands < 1:
+        raise ValueError(f"--max-hands must be 1 or more; got {max_hands}")
+    if (given := boxes_beside(folder)) is not None:
+        say(f"hands are where {given} says")
+        return given
+    found = out / FOUND_FILE
+    find_keypoints(folder, found, rig, max_hands, video)
+    return found
+
+
 def find_keypoints(
     folder: Path, out: Path, rig_file: Path | None, max_hands: int = 2, video: bool = False
 ) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from poem_jax.cli.detect import FOUND_FILE, find_keypoints
+from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 class Fit:
     """Fit hands to 2D key points from several calibrated cameras: no images are needed.
 
-    Given a capture's folder instead, the key points are found in its images first, as by `poem detect`.
+    Given a capture's folder, its boxes.npz or keypoints.npz is taken, or the key points are found in its
+    images first, as by `poem detect`.
     Writes what `reconstruct` writes, with pose, shape and place of the hand model, and the uncertainty of
     every joint; see docs/fitting.md.
     """
@@ -34,7 +35,7 @@ class Fit:
     video: Flag = False
     """As for `poem detect`."""
     images: OptionalFolder = None
-    """Capture folder with the images to draw on; that which is given as DIR."""
+    """Capture folder with the images to draw on, where KEYPOINTS is a file."""
     mano: OptionalFile = None
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
@@ -53,12 +54,16 @@ class Fit:
 
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
+        hand = hand_from(self.mano)
         keypoints, images = self.keypoints, self.images
         if keypoints.is_dir():
-            images, keypoints = images or keypoints, self.out / FOUND_FILE
-            find_keypoints(self.keypoints, keypoints, self.rig, self.max_hands, self.video)
+            if images is not None:
+                raise ValueError(
+                    f"--images goes with a file of key points; {keypoints} is a folder of images"
+                )
+            images = keypoints
+            keypoints = where_hands_are(images, self.out, self.rig, self.max_hands, self.video)
         take = read_keypoint_take(keypoints, self.rig, images)
-        hand = hand_from(self.mano)
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):
             meshes = self.meshes or None

@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from poem_jax.cli.detect import FOUND_FILE, find_keypoints
+from poem_jax.cli.detect import where_hands_are
+from poem_jax.cli.fit import hand_from
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.capture.write import Written
+    from poem_jax.hand.model import HandModel
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Reconstruct:
     rig: OptionalFile = None
     """Calibration; without it rig.json or calibration/rig.json in DIR."""
     boxes: OptionalFile = None
-    """Boxes or key points (npz); without it boxes.npz in DIR, or what the detector finds."""
+    """Boxes or key points (npz); without it boxes.npz or keypoints.npz in DIR, or what the detector finds."""
     max_hands: int = 2
     """Hands that are looked for where neither boxes nor key points are given."""
     video: Flag = False
@@ -35,7 +37,7 @@ class Reconstruct:
     checkpoint: OptionalFolder = None
     """Model folder that poem_jax.save wrote; without it the shipped weights."""
     engine: Literal["network", "fit"] = "network"
-    """fit: no network, the hand model fitted to key points (then --boxes must hold them)."""
+    """fit: no network, the hand model fitted to key points (if boxes are given they must hold them)."""
     mano: OptionalFile = None
     """With --engine fit, as for `poem fit`."""
     smooth: Flag = False
@@ -47,7 +49,6 @@ class Reconstruct:
 
     def run(self) -> None:
         """Write the results and print where they are."""
-        from poem_jax.capture.take import boxes_beside
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
@@ -57,16 +58,12 @@ class Reconstruct:
             raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
-        boxes = self.boxes or boxes_beside(self.folder) or self._find()
+        hand = hand_from(self.mano)
+        boxes = self.boxes or where_hands_are(self.folder, self.out, self.rig, self.max_hands, self.video)
         with tells_what_is_left(self.out):
-            written = self._fit(boxes) if self.engine == "fit" else self._reconstruct(boxes)
+            written = self._fit(boxes, hand) if self.engine == "fit" else self._reconstruct(boxes)
         print_files(written, self.out)
         print_summary(written.report)
-
-    def _find(self) -> Path:
-        boxes = self.out / FOUND_FILE
-        find_keypoints(self.folder, boxes, self.rig, self.max_hands, self.video)
-        return boxes
 
     def _reconstruct(self, boxes: Path) -> "Written":
         from poem_jax.capture.pipeline import reconstruct
@@ -76,12 +73,10 @@ class Reconstruct:
         say(f"{take.num_frames} frames; the first run on a machine compiles the model, once")
         return reconstruct(take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None)
 
-    def _fit(self, boxes: Path) -> "Written":
+    def _fit(self, boxes: Path, hand: "HandModel | None") -> "Written":
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
-        from poem_jax.cli.fit import hand_from
 
         take = read_take(self.folder, self.rig, boxes)
-        hand = hand_from(self.mano)
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         return fit(take, self.out, hand=hand, smooth=self.smooth, meshes=self.meshes or None)

@@ -4,7 +4,9 @@ Pictures are cut out by OpenCV where the images lie, and both networks run on pi
 program depends on the size of an image or on how many hands it shows, and little travels to an accelerator.
 """
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -24,8 +26,13 @@ MIN_PRESENCE = 0.5
 _SAME_PLACE = 0.5
 """Intersection over union above which two regions are of one hand; the later replaces the earlier."""
 _RIGHT = 0.5
-_BATCHES = (1, 8)
-"""Pictures that a program takes: there is one program for each size and network."""
+_LOOK_AGAIN = 10
+"""Frames of a video after which palms are looked for though enough hands are followed."""
+_MAX_SIDE = 2**15 - 2
+"""Of an image, pixels: OpenCV takes pictures by places of 16 bits."""
+_BATCH = 8
+"""Pictures that a program takes on an accelerator."""
+_ONE_THREAD = {"xla_cpu_multi_thread_eigen": False}
 
 
 class DetectedHand(NamedTuple):
@@ -60,22 +67,27 @@ def find_hands(images: Sequence[Array], *, max_hands: int = 2) -> list[list[Dete
 class HandTracker:
     """Finds the hands in the frames of a video of one camera.
 
-    The hands of the last frame say where to look; the palm network runs only while fewer than `max_hands` are
-    followed.
+    The hands of the last frame say where to look; the palm network runs while fewer than `max_hands` are
+    followed, and every tenth frame, lest a face be followed for ever.
     """
 
     def __init__(self, max_hands: int = 2) -> None:
         self._max_hands = max_hands
         self._last: list[Region] = []
+        self._turn = 0
 
     def find_hands(self, image: Array) -> list[DetectedHand]:
         """Find the hands in the next frame; arguments and errors as `find_hands`."""
         _check([image], self._max_hands)
-        regions = self._last
-        if len(regions) < self._max_hands:
-            (new,) = _regions_of_palms([image], self._max_hands)
-            regions = _without_doubles([*new, *regions])[: self._max_hands]
-        (hands,) = _look([image], [regions])
+        (hands,) = _look([image], [self._last])
+        self._turn += 1
+        if len(hands) < self._max_hands or self._turn % _LOOK_AGAIN == 0:
+            (palms,) = _regions_of_palms([image], self._max_hands)
+            followed = [region_of_hand(hand.keypoints_px) for hand in hands]
+            new = [region for region in palms if all(overlap(region, one) <= _SAME_PLACE for one in followed)]
+            (more,) = _look([image], [new])
+            # A face that was taken for a hand gives its place to a surer one.
+            hands = sorted([*hands, *more], key=lambda hand: -hand.score)[: self._max_hands]
         self._last = _without_doubles([region_of_hand(hand.keypoints_px) for hand in hands])
         return hands
 
@@ -90,13 +102,15 @@ def _check(images: Sequence[Any], max_hands: int) -> None:
                 f"`images` must be RGB arrays (h, w, 3) of uint8; number {index} has shape {shape} and dtype "
                 f"{dtype}"
             )
+        if max(shape) > _MAX_SIDE:
+            raise ValueError(f"`images` must be at most {_MAX_SIDE} pixels wide and high; got {shape}")
 
 
 def _regions_of_palms(images: Sequence[Array], max_hands: int) -> list[list[Region]]:
     """Return where hands may be in every image."""
     pictures = [letterbox(image) for image in images]
     regions = []
-    for image, logits, guesses in zip(images, *_run(_palm_program(), pictures), strict=True):
+    for image, logits, guesses in zip(images, *_palm_program()(pictures), strict=True):
         palms = find_palms(logits, guesses, image.shape[:2])[:max_hands]
         regions.append(_without_doubles([region_of_palm(palm) for palm in palms]))
     return regions
@@ -109,7 +123,7 @@ def _look(images: Sequence[Array], regions: Sequence[Sequence[Region]]) -> list[
     if not places:
         return hands
     pictures = [cut_out(images[number], region) for number, region in places]
-    seen = Landmarks(*_run(_landmark_program(), pictures))
+    seen = Landmarks(*_landmark_program()(pictures))
     for (number, region), points, presence, right in zip(places, *seen, strict=True):
         if presence > MIN_PRESENCE:
             side = "right" if right > _RIGHT else "left"
@@ -128,28 +142,48 @@ def _without_doubles(regions: Sequence[Region]) -> list[Region]:
     ]
 
 
-def _run(program: Any, pictures: Sequence[UInt8[Array, "size size 3"]]) -> list[Array]:
-    """Run a network on pictures; on a CPU one on each thread, elsewhere in batches."""
-    size = _BATCHES[0] if jax.default_backend() == "cpu" else _BATCHES[1]
-    groups = [pictures[start : start + size] for start in range(0, len(pictures), size)]
+class _Program:
+    """A network with its weights, compiled for one picture (CPU) or eight (accelerators) at a time."""
 
-    def run(group: Sequence[Array]) -> list[Array]:
-        filled = [*group, *[group[-1]] * (size - len(group))]
-        return [np.asarray(out)[: len(group)] for out in program(np.stack(filled))]
+    def __init__(self, network: Any, weights: Any) -> None:
+        def run(weights: Any, pictures: Array) -> Any:
+            return network(weights, pictures.astype(jnp.float32) / 255)
 
-    return [np.concatenate(parts) for parts in zip(*map(run, groups), strict=True)]
+        self._weights = jax.device_put(weights)
+        self._alone = jax.jit(run)
+        self._one_thread = jax.jit(run, compiler_options=_ONE_THREAD)
+        self._compiled: Any = None
+
+    def __call__(self, pictures: Sequence[UInt8[Array, "size size 3"]]) -> list[Array]:
+        """Run the network; on a CPU several pictures side by side, one thread each."""
+        on_cpu = jax.default_backend() == "cpu"
+        size = 1 if on_cpu else _BATCH
+        groups = [pictures[start : start + size] for start in range(0, len(pictures), size)]
+        if on_cpu and len(groups) > 1:
+            program = self._beside_others(pictures[0].shape)
+            with ThreadPoolExecutor(min(len(groups), os.cpu_count() or 1)) as pool:
+                parts = list(pool.map(partial(self._run, program, size), groups))
+        else:
+            parts = [self._run(self._alone, size, group) for group in groups]
+        return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+
+    def _beside_others(self, shape: tuple[int, ...]) -> Any:
+        """Return the program that takes one thread, compiled before several threads ask for it."""
+        if self._compiled is None:
+            picture = jax.ShapeDtypeStruct((1, *shape), jnp.uint8)
+            self._compiled = self._one_thread.lower(self._weights, picture).compile()
+        return self._compiled
+
+    def _run(self, program: Any, size: int, group: Sequence[Array]) -> list[Array]:
+        filled = np.stack([*group, *[group[-1]] * (size - len(group))])
+        return [np.asarray(out)[: len(group)] for out in program(self._weights, filled)]
 
 
 @cache
-def _palm_program() -> Any:
-    return _compiled(palm_network, palm_weights())
+def _palm_program() -> _Program:
+    return _Program(palm_network, palm_weights())
 
 
 @cache
-def _landmark_program() -> Any:
-    return _compiled(landmark_network, landmark_weights())
-
-
-def _compiled(network: Any, weights: Any) -> Any:
-    run = jax.jit(lambda weights, pictures: network(weights, pictures.astype(jnp.float32) / 255))
-    return partial(run, jax.device_put(weights))
+def _landmark_program() -> _Program:
+    return _Program(landmark_network, landmark_weights())
