@@ -1,10 +1,11 @@
 """Make the weights of the hand detector from MediaPipe's wheel.
 
     pip download --no-deps mediapipe==0.10.14
-    python tools/convert_detector.py mediapipe-0.10.14-*.whl
+    python -m tools.convert_detector mediapipe-0.10.14-*.whl
 
 The wheel is a zip; nothing of it is run. Digest of each network, kinds, strides, activations and shapes of
-all its operators are compared with the network as `poem_jax.detection` runs it, before anything is written.
+its operators, in their order, are compared with the network as `poem_jax.detection` runs it, before anything
+is written.
 """
 
 import hashlib

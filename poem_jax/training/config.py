@@ -216,6 +216,10 @@ class TrainConfig:
             tuple(data.image_hw) == tuple(self.model.image_hw),
             f"`data.synthetic.image_hw` must be the model's {self.model.image_hw}; got {data.image_hw}",
         )
+        require(
+            not self.model.crop.upright,
+            "`model.crop.upright` is for models of upright hands; the synthetic captures are not turned",
+        )
         max_views = max(shape.num_views for shape in self.data.batches)
         require(
             max_views <= data.num_views,

@@ -58,7 +58,24 @@ def test_hands_go_to_their_frame_and_view(capture, rig, seen, hand_world, caplog
     np.testing.assert_allclose(hands.keypoints_px[1, 0, 0], project_raw(rig, 0, hand_world)[0])
     np.testing.assert_allclose(hands.confidence[1, 0, :2], 0.9)
     assert np.isnan(hands.confidence[:, 0, 2]).all()
-    assert f"{rig.names[2]}.png" in caplog.text
+    assert f"frame 0: an image is left out: there is none of camera '{rig.names[2]}'" in caplog.text
+    assert f"camera '{rig.names[2]}': 2 of 2 images are left out in all" in caplog.text
+
+
+def test_a_camera_that_shows_no_hand_is_named(capture, rig, seen, caplog):
+    def blind(views, images):
+        return [[] if view == 1 else hands for view, hands in zip(views, seen(views, images), strict=True)]
+
+    hands = detect_hands(capture, rig, detector=blind, progress=False)
+    assert np.isfinite(hands.boxes_px).all(-1).sum() == 2
+    assert f"camera '{rig.names[1]}' shows no hand in any image" in caplog.text
+    assert f"only camera {rig.names[0]} sees hands" in caplog.text
+
+
+def test_images_none_of_which_can_be_read_name_the_first(capture, rig):
+    small = rig._replace(size_wh=rig.size_wh // 2)
+    with pytest.raises(ValueError, match="left_cam.png is 240 x 180; the rig was calibrated at 120 x 90"):
+        detect_hands(capture, small, progress=False)
 
 
 def test_guesses_beyond_the_border_are_unseen(capture, rig, hand_world):
@@ -90,6 +107,22 @@ def test_a_search_that_is_stopped_keeps_the_frames_that_are_done(capture, rig, s
     assert np.isfinite(hands.boxes_px).all(-1).sum() == 2
 
 
+def test_a_search_that_is_stopped_too_early_writes_nothing(capture, rig, seen, caplog):
+    def disagreeing(views, images):
+        if images[0][0, 0, 0] >= 20:
+            raise KeyboardInterrupt
+        return [
+            [hand._replace(keypoints_px=hand.keypoints_px + 40 * view * np.array([1, -1]))]
+            for view, (hand,) in zip(views, seen(views, images), strict=True)
+        ]
+
+    kept = []
+    with pytest.raises(KeyboardInterrupt):
+        detect_hands(capture, rig, detector=disagreeing, when_stopped=kept.append, progress=False)
+    assert kept == []
+    assert "nothing is written of the frames that were searched" in caplog.text
+
+
 def test_no_hand_at_all_is_an_error(capture, rig):
     with pytest.raises(ValueError, match="no hand was found in any image of 2 frames"):
         detect_hands(capture, rig, detector=lambda views, images: [[] for _ in views], progress=False)
@@ -117,6 +150,19 @@ def test_a_number_of_hands_below_one_is_refused(make_capture, tmp_path, capsys, 
     (folder / "boxes.npz").unlink(missing_ok=True)
     assert main([command, str(folder), "--out", str(tmp_path / "out"), "--max-hands", "0"]) == 2
     assert "--max-hands must be 1 or more; got 0" in capsys.readouterr().err
+
+
+def test_key_points_beside_the_images_are_taken(make_capture, tmp_path, capsys):
+    folder = make_capture(keypoints=True).folder
+    (folder / "boxes.npz").rename(folder / "keypoints.npz")
+    assert main(["fit", str(folder), "--out", str(tmp_path / "out")]) in (0, 2)
+    assert f"hands are where {folder / 'keypoints.npz'} says" in capsys.readouterr().err
+
+
+def test_a_folder_of_images_brings_its_own(make_capture, tmp_path, capsys):
+    folder = make_capture().folder
+    assert main(["fit", str(folder), "--images", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "--images goes with a file of key points" in capsys.readouterr().err
 
 
 @pytest.mark.parity
