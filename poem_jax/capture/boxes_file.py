@@ -11,7 +11,8 @@ optional `cameras (V,)` of names, by which views in another order than the rig's
 have a `confidence (F, H, V, 21)` from 0 to 1, NaN = unseen: those below `MIN_CONFIDENCE` count as unseen, and
 so do those at exactly (0, 0) or (-1, -1), where detectors put what they do not find. Key points count pixels
 from the centre of the top-left one, as detectors and calibrations do, and are moved by half a pixel here; a
-box gives edges, so that the whole image is 0 0 W H.
+box gives edges, so that the whole image is 0 0 W H. A text `detector` names what found the key points
+(`fitting.detector_offsets` knows some).
 """
 
 import logging
@@ -63,6 +64,8 @@ class HandBoxes(NamedTuple):
     """Of the key points; None where the file gives none."""
     cameras: tuple[str, ...] | None = None
     """Names of the views as the file gives them, None where it gives none."""
+    detector: str | None = None
+    """What found the key points, None where the file does not say."""
 
 
 def read_boxes(path: str | os.PathLike) -> HandBoxes:
@@ -97,7 +100,8 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
             f"got {keypoints.shape[:3]} and {boxes.shape[:3]}"
         )
     confidence = content.get("confidence") if keypoints is not None else None
-    return HandBoxes(boxes, sides, frames, keypoints, confidence, _cameras(content, boxes.shape[2], path))
+    cameras = _cameras(content, boxes.shape[2], path)
+    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, _detector(content, path))
 
 
 def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
@@ -111,6 +115,8 @@ def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
         content["confidence"] = boxes.confidence
     if boxes.cameras is not None:
         content["cameras"] = np.array(boxes.cameras)
+    if boxes.detector is not None:
+        content["detector"] = np.array(boxes.detector)
     # A stream, since NumPy would add a suffix to a name that has none.
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **content)
@@ -333,6 +339,15 @@ def _cameras(content: Mapping[str, Array], num_views: int, path: Path) -> tuple[
     if len(names) != num_views:
         raise ValueError(f"{path}: `cameras` must name {num_views} views; got {len(names)}")
     return safe_file_names(names, f"{path}: `cameras`")
+
+
+def _detector(content: Mapping[str, Array], path: Path) -> str | None:
+    if "detector" not in content:
+        return None
+    names = _texts(content["detector"])
+    if len(names) != 1:
+        raise ValueError(f"{path}: `detector` must be one name; got {len(names)}")
+    return names[0].strip() or None
 
 
 def _texts(array: Array) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
 from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.read import image_of_camera
 from poem_jax.detection import DetectedHand, HandTracker, find_hands
+from poem_jax.fitting.detector_offsets import MEDIAPIPE_HANDS
 from poem_jax.geometry.rig import Rig
 from poem_jax.typing import Array, Float, UInt8
 
@@ -54,11 +55,12 @@ def detect_hands(
         progress: Show a progress bar when there are several frames.
 
     Returns: key points (frame, hand, view, 21, 2) in the raw images, right hands first; NaN = not found, or
-        beyond the image's border.
+        beyond the image's border. They name our detector, and none where another was given.
 
     Raises:
         ValueError: No image can be read, no hand was found, or no two cameras agree on one.
     """
+    name = MEDIAPIPE_HANDS if detector is None else None
     search = _Search(rig, _our_detector(rig.num_views, max_hands, video) if detector is None else detector)
     found: list[Found] = []
     try:
@@ -66,10 +68,10 @@ def detect_hands(
             found.append(search.look(paths))
     except KeyboardInterrupt:
         if when_stopped is not None:
-            _hand_over(found, frames, rig, max_hands, when_stopped)
+            _hand_over(found, frames, rig, max_hands, name, when_stopped)
         raise
     search.report(found, len(frames))
-    return _hand_boxes(found, frames, rig, max_hands)
+    return _hand_boxes(found, frames, rig, max_hands, name)
 
 
 class _Search:
@@ -131,25 +133,29 @@ def _hand_over(
     frames: Sequence[FramePaths],
     rig: Rig,
     max_hands: int,
+    detector: str | None,
     when_stopped: Callable[[HandBoxes], object],
 ) -> None:
     """Pass on what was found so far, if it is enough to tell hands apart."""
     try:
-        hands = _hand_boxes(found, frames[: len(found)], rig, max_hands)
+        hands = _hand_boxes(found, frames[: len(found)], rig, max_hands, detector)
     except ValueError as error:
         _log.warning("nothing is written of the frames that were searched: %s", error)
         return
     when_stopped(hands)
 
 
-def _hand_boxes(found: list[Found], frames: Sequence[FramePaths], rig: Rig, max_hands: int) -> HandBoxes:
+def _hand_boxes(
+    found: list[Found], frames: Sequence[FramePaths], rig: Rig, max_hands: int, detector: str | None
+) -> HandBoxes:
+    """Put what `detector` found into one track a hand."""
     names = tuple(frame.name for frame in frames)
     hands = associate_hands(found, rig, max_hands=max_hands, frame_names=names)
     for warning in hands.warnings:
         _log.warning("%s", warning)
     keypoints = _within(hands.keypoints_px, rig)
     boxes = boxes_from_keypoints(keypoints)
-    return HandBoxes(boxes, hands.hand_side, names, keypoints, _confidence(hands), rig.names)
+    return HandBoxes(boxes, hands.hand_side, names, keypoints, _confidence(hands), rig.names, detector)
 
 
 def _within(

@@ -19,6 +19,7 @@ from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
 from poem_jax.capture.take import Take
+from poem_jax.fitting.detector_offsets import offsets_of
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.model import HandModel, mirror
 from poem_jax.hand.topology import ROOT_JOINT
@@ -26,6 +27,8 @@ from poem_jax.typing import Array
 
 if TYPE_CHECKING:
     from poem_jax.fitting import FitConfig, FitResult
+    from poem_jax.fitting.detector_offsets import KeypointOffsets
+    from poem_jax.fitting.kinematics import KeypointModel
 
 NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by two views that agree on them"
 
@@ -56,7 +59,9 @@ def hands_of(model: HandModel) -> Hands:
     return Hands(reflected, model) if model.side == "left" else Hands(model, reflected)
 
 
-def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool = False) -> Iterator[Frame]:
+def fit_hands(
+    frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool = False, detector: str | None = None
+) -> Iterator[Frame]:
     """Fit the hands of a stream to their key points.
 
     Args:
@@ -64,6 +69,8 @@ def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool
         take: Its cameras and the sides of its hands.
         hands: The hand models.
         smooth: Add a second pass that holds each hand's frames together.
+        detector: Name of what found the key points (`fitting.detector_offsets`), whose habits the fit then
+            takes into account; "none" takes the key points to be the joints; None = as the take names it.
 
     Returns: the stream with its hands, a warning at the frame where it was noticed.
 
@@ -75,8 +82,9 @@ def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool
         raise ValueError(f"a fit needs at least two views; the rig has {take.rig.num_views}")
     check_each_camera(take.rig)
     config = fit_config(take.rig, smooth)
+    offsets = offsets_of(take.detector if detector is None else detector)
     fits = [
-        _HandFit(name, hands.of(side), hands.other(side), config)
+        _HandFit(name, _keypoint_models(hands, side, offsets), config)
         for name, side in zip(take.hand_names, take.hand_sides, strict=True)
     ]
     checked = said = False
@@ -96,6 +104,15 @@ def fit_hands(frames: Iterable[Frame], take: Take, hands: Hands, *, smooth: bool
             results = tuple(_result(result, turn) for result in fitted)
             yield group[turn]._replace(hands=results, warnings=(*group[turn].warnings, *warnings))
             warnings = []
+
+
+def _keypoint_models(
+    hands: Hands, side: str, offsets: "KeypointOffsets | None"
+) -> tuple["KeypointModel", "KeypointModel"]:
+    """Return what a fit needs of the hand of a side, and of its mirror image."""
+    from poem_jax.fitting import keypoint_model
+
+    return keypoint_model(hands.of(side), offsets), keypoint_model(hands.other(side), offsets)
 
 
 def fit_config(rig: Rig, smooth: bool) -> "FitConfig":
@@ -137,8 +154,10 @@ def _observed(group: list[Frame]) -> tuple[Array, Array]:
 class _HandFit:
     """One hand through the take, and as a check one of the other side."""
 
-    def __init__(self, name: str, own: HandModel, other: HandModel, config: "FitConfig") -> None:
-        self._name, self._models, self._config = name, (own, other), config
+    def __init__(
+        self, name: str, models: tuple["KeypointModel", "KeypointModel"], config: "FitConfig"
+    ) -> None:
+        self._name, self._models, self._config = name, models, config
         self._shapes: tuple[Array | None, Array | None] = (None, None)
         self._judged = self._said = False
         self._warnings: list[str] = []
@@ -164,12 +183,17 @@ class _HandFit:
 
 
 def _run(
-    hand: HandModel, keypoints: Array, confidence: Array, rig: Rig, config: "FitConfig", shape: Array | None
+    model: "KeypointModel",
+    keypoints: Array,
+    confidence: Array,
+    rig: Rig,
+    config: "FitConfig",
+    shape: Array | None,
 ) -> "FitResult":
     """Fit a group of frames, padded to the one size for which there is a program; None = unknown shape."""
     import jax
 
-    from poem_jax.fitting import Observations, fit_take, keypoint_model
+    from poem_jax.fitting import Observations, fit_take
     from poem_jax.fitting.lm import ShapeMode
 
     if shape is not None:
@@ -177,7 +201,7 @@ def _run(
         config = dataclasses.replace(config, lm=lm)
     padded = (padded_frames(keypoints), padded_frames(confidence))
     observations = Observations(*padded, rig.K, rig.T_cam_from_world)
-    fitted = jax.device_get(fit_take(keypoint_model(hand), observations, shape, config))
+    fitted = jax.device_get(fit_take(model, observations, shape, config))
     return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
 
 
@@ -193,5 +217,6 @@ def _result(fitted: "FitResult", turn: int) -> HandResult:
         pose=fitted.pose[turn],
         shape=fitted.shape[turn],
         translation=fitted.translation[turn],
+        expected_world=fitted.keypoints[turn],
         joint_sigma_m=fitted.sigma_m[turn],
     )

@@ -42,6 +42,8 @@ class HandResult(NamedTuple):
     """Axis-angle, radians, where the engine has a parametric hand."""
     shape: Float[Array, "10"] | None = None
     translation: Float[Array, "3"] | None = None
+    expected_world: Float[Array, "21 3"] | None = None
+    """Where the detector of the key points should see the joints; None = at `joints_world`."""
     joint_sigma_m: Float[Array, "21"] | None = None
     """Standard deviation of one coordinate of each joint, where the engine knows it."""
     keypoints_px: Float[Array, "view joint 2"] | None = None

@@ -94,8 +94,9 @@ def _evidence(frame: Frame, index: int) -> Evidence:
 
 
 def _measured(hand: HandResult, evidence: Evidence, rig: Rig) -> HandResult:
+    expected = hand.joints_world if hand.expected_world is None else hand.expected_world
     return hand._replace(
-        reprojection_px=reprojection_error(hand.joints_world, evidence, rig),
+        reprojection_px=reprojection_error(expected, evidence, rig),
         joints_shown=joints_shown(hand.joints_world, hand.view_mask, rig),
     )
 

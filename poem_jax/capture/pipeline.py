@@ -71,6 +71,7 @@ def fit(
     *,
     hand: HandModel | None = None,
     smooth: bool = False,
+    detector: str | None = None,
     meshes: bool | None = None,
     progress: bool = True,
 ) -> Written:
@@ -84,6 +85,7 @@ def fit(
         out: Folder for the results.
         hand: The user's hand in MANO's schema, of either side; None = the shipped hand.
         smooth: Add a second pass that holds each hand's frames together.
+        detector: What found the key points, as for `fit_hands`; None = as their file names it.
         meshes: Write the meshes of every frame; None = if there is only one.
         progress: Show a progress bar when there are several frames.
 
@@ -97,8 +99,9 @@ def fit(
     check_folder_is_writable(out)
     clock = Clock()
     hands = hands_of(default_hand() if hand is None else hand)
-    engine = functools.partial(by_fit, hands=hands, smooth=smooth)
+    engine = functools.partial(by_fit, hands=hands, smooth=smooth, detector=detector)
     about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
+    about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
     return _run(take, Path(out), engine, faces, clock, about, meshes, progress)
 
@@ -112,9 +115,11 @@ def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Netwo
     return clock.timed("predict", predict_hands(frames, take, network))
 
 
-def by_fit(frames: Iterable[Frame], take: Take, clock: Clock, hands: Hands, smooth: bool) -> Iterator[Frame]:
+def by_fit(
+    frames: Iterable[Frame], take: Take, clock: Clock, hands: Hands, smooth: bool, detector: str | None
+) -> Iterator[Frame]:
     """Find hands from key points; images are read afterwards, to be drawn on."""
-    frames = clock.timed("predict", fit_hands(frames, take, hands, smooth=smooth))
+    frames = clock.timed("predict", fit_hands(frames, take, hands, smooth=smooth, detector=detector))
     return clock.timed("read", read_images(frames, take.rig, needed=False))
 
 

@@ -33,6 +33,8 @@ class Take(NamedTuple):
     """'left' or 'right' of every hand that is followed through the take."""
     frames: Iterable[Frame]
     """In order, taken one after the other; how many there are need not be known."""
+    detector: str | None = None
+    """What found the key points, as their file names it; None = it does not say."""
 
     @property
     def hand_names(self) -> tuple[str, ...]:
@@ -149,7 +151,8 @@ def make_take(rig: Rig, paths: Sequence[FramePaths], hands: HandBoxes) -> Take:
     """
     names = safe_file_names([frame.name for frame in paths], "names of frames")
     _check_numbers_differ(names)
-    return Take(rig, hands.hand_side, StoredFrames(paths, without_boxes_outside(hands, rig.size_wh)))
+    frames = StoredFrames(paths, without_boxes_outside(hands, rig.size_wh))
+    return Take(rig, hands.hand_side, frames, hands.detector)
 
 
 def in_groups(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:

@@ -8,7 +8,7 @@ import tyro
 
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder
+from poem_jax.cli.options import Detector, Flag, Folder, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.hand.model import HandModel
@@ -40,6 +40,9 @@ class Fit:
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
     """Hold the frames of a take together in a second pass."""
+    detector: Detector = "file"
+    """What found the key points, whose habits the fit allows for; file: what KEYPOINTS names, if anything;
+    none: nothing known, they are the joints and finger tips."""
     meshes: Flag = False
     """Write the meshes of every frame of a take too, not only its animation."""
     debug: Flag = False
@@ -67,9 +70,15 @@ class Fit:
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):
             meshes = self.meshes or None
-            written = fit(take, self.out, hand=hand, smooth=self.smooth, meshes=meshes)
+            detector = named_detector(self.detector)
+            written = fit(take, self.out, hand=hand, smooth=self.smooth, detector=detector, meshes=meshes)
         print_files(written, self.out)
         print_summary(written.report)
+
+
+def named_detector(option: Detector) -> str | None:
+    """Return the name that overrides the file's; None = as the file says."""
+    return None if option == "file" else option
 
 
 def hand_from(path: Path | None) -> "HandModel | None":

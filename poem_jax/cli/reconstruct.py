@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.fit import hand_from
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
+from poem_jax.cli.options import Detector, Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.capture.write import Written
@@ -42,6 +42,8 @@ class Reconstruct:
     """With --engine fit, as for `poem fit`."""
     smooth: Flag = False
     """With --engine fit, as for `poem fit`."""
+    detector: Detector = "file"
+    """With --engine fit, as for `poem fit`."""
     meshes: Flag = False
     """Write the meshes of every frame of a take too, not only its animation."""
     debug: Flag = False
@@ -56,6 +58,8 @@ class Reconstruct:
             raise ValueError("--checkpoint is for --engine network; a fit has no weights")
         if self.engine == "network" and (self.mano is not None or self.smooth):
             raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
+        if self.engine == "network" and self.detector != "file":
+            raise ValueError("--detector is for --engine fit; the network sees the images themselves")
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
         hand = hand_from(self.mano)
@@ -76,7 +80,15 @@ class Reconstruct:
     def _fit(self, boxes: Path, hand: "HandModel | None") -> "Written":
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
+        from poem_jax.cli.fit import named_detector
 
         take = read_take(self.folder, self.rig, boxes)
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
-        return fit(take, self.out, hand=hand, smooth=self.smooth, meshes=self.meshes or None)
+        return fit(
+            take,
+            self.out,
+            hand=hand,
+            smooth=self.smooth,
+            detector=named_detector(self.detector),
+            meshes=self.meshes or None,
+        )

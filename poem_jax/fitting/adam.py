@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from poem_jax.fitting.anatomy_loss import anatomy_loss, anatomy_terms, rotations_from_raw_quaternions
-from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints_of_rotations
+from poem_jax.fitting.kinematics import KeypointModel, joints_of, pose_keypoints_of_rotations
 from poem_jax.fitting.observations import Observations
 from poem_jax.fitting.silhouette import (
     Masks,
@@ -147,7 +147,11 @@ def fitting_loss(
     keypoints = jnp.mean(seen.weights * square) / diagonal_px**2
     anatomy = anatomy_loss(
         anatomy_terms(
-            parameters.quaternions, parameters.shape, posed.rotations, posed.points, model.hand.is_left
+            parameters.quaternions,
+            parameters.shape,
+            posed.rotations,
+            joints_of(model, posed),
+            model.hand.is_left,
         )
     )
     loss = KEYPOINT_WEIGHT * keypoints + ANATOMY_WEIGHT * anatomy

@@ -10,6 +10,9 @@ linear in the shaped rest positions r (key points) and J (skeleton); G_k = world
 by the small world vector dw of joint j moves X_p by dw x c_pj, c_pj = sum_{k in or below j} w_pk (X_pk -
 P_j), X_pk where joint k alone would carry p, P_j the joint's place. An axis-angle vector theta of joint j
 turns by dw = G_parent(j) Jl(theta) dtheta, Jl the left Jacobian of SO(3) (Sola et al. 2018, eq. 145).
+
+A detector may see key points at other places than the joints of the hand (`detector_offsets`): its offsets o
+join the rest positions of the key points, r_p + o_p, and leave the skeleton alone.
 """
 
 from typing import NamedTuple
@@ -17,6 +20,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from poem_jax.fitting.detector_offsets import KeypointOffsets, rest_offsets
 from poem_jax.geometry.transforms import matmul, rotation_from_axis_angle, skew_matrix
 from poem_jax.hand.joint_limits import POSE_LIMITS, anatomical_axes
 from poem_jax.hand.model import HandModel, forward_kinematics, layer_tips
@@ -70,12 +74,15 @@ class KeypointModel(NamedTuple):
     """Anatomical axes: rows flexion, abduction, twist."""
     limits: Float[Array, "15 3 2"]
     """(lowest, highest) of the anatomical angles, radians."""
+    offsets: Float[Array, "21 3"] | None = None
+    """From the rest key points to where a detector sees them, metres; None = it sees them there."""
 
 
 class PosedKeypoints(NamedTuple):
     """Key points of a pose, wrist at the origin, and what their derivatives need."""
 
     points: Float[Array, "*batch 21 3"]
+    """As a detector sees them: moved by the model's offsets, if it has any."""
     rotations: Float[Array, "*batch 16 3 3"]
     """World rotation of every joint."""
     local: Float[Array, "*batch 16 3 3"]
@@ -84,13 +91,18 @@ class PosedKeypoints(NamedTuple):
     skeleton: Float[Array, "*batch 16 3"]
     """Shaped skeleton at rest, wrist at the origin."""
     rest: Float[Array, "*batch 21 3"]
-    """Shaped key points at rest with their pose correction."""
+    """Shaped key points at rest with their pose correction, and the offsets if there are any."""
 
 
-def keypoint_model(hand: HandModel) -> KeypointModel:
+def keypoint_model(hand: HandModel, detector: KeypointOffsets | None = None) -> KeypointModel:
     """Reduce a concrete hand to what its key points need; call it once, outside `jax.jit`.
 
     Two hands' models may be stacked leaf by leaf and mapped over.
+
+    Args:
+        hand: of either side.
+        detector: where the detector of the key points sees them (`detector_offsets.DETECTORS`); None takes
+            them to be the hand's own joints and tips. What a fit returns are those in either case.
     """
     hand = HandModel(*(np.asarray(array) for array in hand))
     tips = layer_tips(hand)
@@ -108,6 +120,7 @@ def keypoint_model(hand: HandModel) -> KeypointModel:
         correctives=hand.posedirs[tips],
         axes=anatomical_axes(hand).astype(skeleton.dtype),
         limits=POSE_LIMITS.astype(skeleton.dtype),
+        offsets=None if detector is None else rest_offsets(hand, detector).astype(skeleton.dtype),
     )
 
 
@@ -127,6 +140,8 @@ def pose_keypoints_of_rotations(
     wrist = skeleton[..., :1, :]
     skeleton = skeleton - wrist
     rest = model.points + _directions(model.point_directions, shape) - wrist
+    if model.offsets is not None:
+        rest = rest + model.offsets
     batch = local.shape[:-3]
     features = (local[..., 1:, :, :] - jnp.eye(3, dtype=local.dtype)).reshape(*batch, -1)
     correction = matmul(features, model.correctives.reshape(3 * NUM_FINGERS, -1).T)
@@ -162,6 +177,13 @@ def shape_jacobian(model: KeypointModel, posed: PosedKeypoints) -> Float[Array, 
     return own + moved.reshape(*batch, NUM_JOINTS, 3, NUM_SHAPES)
 
 
+def joints_of(model: KeypointModel, posed: PosedKeypoints) -> Float[Array, "*batch 21 3"]:
+    """Return the hand's own joints and tips of a pose, wrist at the origin: the key points less offsets."""
+    if model.offsets is None:
+        return posed.points
+    return posed.points - _rotate(posed.blended, model.offsets)
+
+
 def rest_wrist(model: KeypointModel, shape: Float[Array, "*batch 10"]) -> Float[Array, "*batch 3"]:
     """Return where the shaped template has its wrist: `translation` = wrist's place - this."""
     return model.skeleton[0] + _directions(model.skeleton_directions[:1], shape)[..., 0, :]
@@ -175,7 +197,7 @@ def _carried(model: KeypointModel) -> Float[Array, "21 16"]:
 def _levers(model: KeypointModel, posed: PosedKeypoints) -> Float[Array, "*batch 21 16 3"]:
     """Return c_pj = sum_{k in or below j} w_pk (X_pk - P_j)."""
     batch = posed.points.shape[:-2]
-    joints = posed.points[..., _SKELETON, :]
+    joints = joints_of(model, posed)[..., _SKELETON, :]
     offset = joints - _rotate(posed.rotations, posed.skeleton)
     carriers = jnp.concatenate([posed.rotations.reshape(*batch, NUM_SKELETON_JOINTS, 9), offset], axis=-1)
     split = (model.weights[:, None, :] * _ANCESTORS.T).reshape(-1, NUM_SKELETON_JOINTS)

@@ -111,6 +111,7 @@ class NormalEquations(NamedTuple):
     g_shape: Float[Array, "frame 10"]
     """Without the shape's prior."""
     D: Float[Array, "frame 21 3 51"]
+    """D and D_shape: derivatives of the hand's own joints, whatever the offsets of a detector."""
     D_shape: Float[Array, "frame 21 3 10"]
 
 
@@ -187,6 +188,10 @@ def normal_equations(
     prior_H, prior_g = prior_equations(model, state, config)
     x = slice(0, STATE_SIZE)
     y = slice(STATE_SIZE, None)
+    if model.offsets is not None:
+        bare = model._replace(offsets=None)
+        turn = pose_jacobian(bare, pose_keypoints(bare, state.pose, state.shape), state.pose)
+        D = jnp.concatenate([turn, place], axis=-1)
     return NormalEquations(
         H[:, x, x] + prior_H, g[:, x] + prior_g, H[:, x, y], H[:, y, y], g[:, y], D, D_shape
     )

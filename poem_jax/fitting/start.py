@@ -8,7 +8,7 @@ stand where the fitted palm would carry them.
 import jax.numpy as jnp
 import numpy as np
 
-from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints
+from poem_jax.fitting.kinematics import KeypointModel, joints_of, pose_keypoints
 from poem_jax.fitting.residuals import anatomical_angles
 from poem_jax.geometry.alignment import apply_similarity, procrustes
 from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, smallest_rotation, transpose
@@ -60,15 +60,15 @@ def closed_form_pose(
     """Return axis-angle pose and wrist place (metres, world) that bring a hand's bones to observed joints.
 
     Args:
-        joints_world: triangulated joints, metres; anything finite where not `valid`.
-        valid: joints to go by. Frames with fewer than three of them get a finite pose that means nothing.
+        joints_world: triangulated key points, metres; anything finite where not `valid`.
+        valid: key points to go by. Frames with fewer than three of them get a finite pose that means nothing.
         shape: proportions of the hand at rest.
 
     Returns: the pose, its angles inside the limits of the joints; and the place of the wrist.
     """
-    rest = pose_keypoints(
-        model, jnp.zeros((*shape.shape[:-1], NUM_SKELETON_JOINTS, 3), shape.dtype), shape
-    ).points
+    flat = jnp.zeros((*shape.shape[:-1], NUM_SKELETON_JOINTS, 3), shape.dtype)
+    posed = pose_keypoints(model, flat, shape)
+    rest = posed.points
     palm = valid & _PALM
     # The knuckles alone lie nearly on one line, about which the palm could turn.
     enough = (jnp.sum(palm, -1) >= MIN_JOINTS) & jnp.any(valid & _WRIST_OR_THUMB_BASE, -1)
@@ -76,7 +76,12 @@ def closed_form_pose(
     fit = procrustes(rest, joints_world, with_scale=False, mask=used)
     joints = jnp.where(valid[..., None], joints_world, apply_similarity(fit, rest))
     pose = axis_angle_from_rotation(_local_turns(fit.R, rest, joints))
-    return _within_limits(model, pose), joints[..., WRIST, :]
+    wrist = joints[..., WRIST, :]
+    if model.offsets is not None:
+        # The wrist's key point lies beside the wrist, and turns with the palm.
+        beside = rest[..., WRIST, :] - joints_of(model, posed)[..., WRIST, :]
+        wrist = wrist - matmul(fit.R, beside[..., None])[..., 0]
+    return _within_limits(model, pose), wrist
 
 
 def _local_turns(

@@ -20,7 +20,7 @@ from jax.core import Tracer
 
 from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
 from poem_jax.fitting.anatomy_loss import rotations_from_raw_quaternions
-from poem_jax.fitting.kinematics import KeypointModel, rest_wrist
+from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints, rest_wrist
 from poem_jax.fitting.lm import (
     LMConfig,
     ShapeMode,
@@ -47,6 +47,8 @@ from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, WRIST
 from poem_jax.typing import Array, Bool, Float
 
+_PLACES = ("translation", "joints", "vertices", "keypoints")
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -66,7 +68,7 @@ class FitConfig:
 class FitResult(NamedTuple):
     """A hand over a take. World frame, metres; where not `valid`, finite numbers that mean nothing.
 
-    Of a far world, `translation`, `joints` and `vertices` are NumPy arrays in float64.
+    Of a far world, `translation`, `joints`, `vertices` and `keypoints` are NumPy arrays in float64.
     """
 
     pose: Float[Array, "frame 16 3"]
@@ -76,11 +78,12 @@ class FitResult(NamedTuple):
     translation: Float[Array, "frame 3"]
     """As `hand_mesh` takes it."""
     joints: Float[Array, "frame 21 3"]
+    """The hand model's own joints and tips, whatever the offsets of the detector."""
     vertices: Float[Array, "frame 778 3"]
     valid: Bool[Array, "frame"]
     """True where at least two views gave three or more joints that do not lie on one line."""
     reprojection_px: Float[Array, "frame view"]
-    """Mean distance of the fitted joints from the key points seen, outliers included; NaN where a view has
+    """Mean distance of the fitted `keypoints` from those seen, outliers included; NaN where a view has
     none."""
     sigma_m: Float[Array, "frame 21"]
     """Standard deviation of one coordinate of each joint; zero where not `valid`."""
@@ -91,6 +94,8 @@ class FitResult(NamedTuple):
     cost: Float[Array, "frame"]
     """How unlikely the hand is in this frame: half the sum of squares, in standard deviations, of key points
     (robust), pose prior and joint limits; NaN where not `valid`. A hand of the wrong side costs more."""
+    keypoints: Float[Array, "frame 21 3"]
+    """Where the detector should see the joints: `joints` moved by the offsets of the model, if it has any."""
 
 
 def fit_take(
@@ -104,7 +109,8 @@ def fit_take(
     Shapes are checked here, so that a wrong one is told in words.
 
     Args:
-        model: `keypoint_model(hand)` of the hand's own side.
+        model: `keypoint_model(hand)` of the hand's own side, with the calibration of the detector if the
+            key points are those of a known one.
         observations: `uv_px` (frame, view, 21, 2); `weights` (frame, view, 21) or None; `K` and
             `T_cam_from_world` (view, ...) or (frame, view, ...).
         shape: the known shape (10,) or (frame, 10); needed by, and only used in, `ShapeMode.GIVEN`.
@@ -211,7 +217,7 @@ def _near_world(
 def _move_back(result: FitResult, origin: Float[np.ndarray, "3"]) -> FitResult:
     if not origin.any():
         return result
-    moved = {name: getattr(result, name) for name in ("translation", "joints", "vertices")}
+    moved = {name: getattr(result, name) for name in _PLACES}
     return result._replace(**{name: np.asarray(x, np.float64) + origin for name, x in moved.items()})
 
 
@@ -289,7 +295,8 @@ def _result(
     translation = state.wrist - rest_wrist(model, state.shape)
     mesh = hand_mesh(model.hand, state.pose, state.shape, translation)
     every = clean(observations, 0)
-    pixels, _ = projection_jacobian(every.K, every.T_cam_from_world, mesh.joints)
+    keypoints = _keypoints(model, state, mesh.joints)
+    pixels, _ = projection_jacobian(every.K, every.T_cam_from_world, keypoints)
     counted = every.weights > 0
     distance = jnp.linalg.norm(pixels - jnp.where(counted[..., None], every.uv_px, pixels + 1), axis=-1)
     count = jnp.sum(counted, axis=-1)
@@ -308,4 +315,12 @@ def _result(
         take.seen.weights > 0,
         sigma_px,
         jnp.where(valid, frame_cost(model, take, state, config.robust_sigmas, config), jnp.nan),
+        keypoints,
     )
+
+
+def _keypoints(model: KeypointModel, state: TakeState, joints: Float[Array, "frame 21 3"]) -> Array:
+    """Return where the detector should see the joints."""
+    if model.offsets is None:
+        return joints
+    return pose_keypoints(model, state.pose, state.shape).points + state.wrist[:, None]
