@@ -65,6 +65,8 @@ def find_keypoints(
 
     if max_hands < 1:
         raise ValueError(f"--max-hands must be 1 or more; got {max_hands}")
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no capture folder at {folder}")
     rig = find_rig(folder, rig_file)
     frames = find_frames(folder, rig.names)
     images = [image for frame in frames for image in frame.images]
