@@ -74,7 +74,7 @@ def test_a_camera_that_shows_no_hand_is_named(capture, rig, seen, caplog):
 
 def test_images_none_of_which_can_be_read_name_the_first(capture, rig):
     small = rig._replace(size_wh=rig.size_wh // 2)
-    with pytest.raises(ValueError, match="left_cam.png is 240 x 180; the rig was calibrated at 120 x 90"):
+    with pytest.raises(ValueError, match=r"left_cam\.png is 240 x 180; the rig was calibrated at 120 x 90"):
         detect_hands(capture, small, progress=False)
 
 
