@@ -3,6 +3,7 @@
 `called` are the names of the frames.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +16,8 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.typing import Array, Bool, Int
 
 _MOST_NAMED = 5
+_OFTEN = 0.2
+"""Share of the frames in which several cameras see what does not meet: more than now and then."""
 
 
 def unsure_matches(followed: Tracks, named: dict[int, str], rig: Rig, called: Sequence[str]) -> list[str]:
@@ -102,10 +105,15 @@ def unconfirmed(
     told = [
         f"{rig.names[view]} in {listed(sorted(set(where)), called)}" for view, where in sorted(places.items())
     ]
+    in_several = Counter(frame for where in places.values() for frame in set(where))
+    often = sum(views > 1 for views in in_several.values()) > _OFTEN * len(frames)
     return [
         f"what looks like a hand to one camera and has no place in space is left out ({'; '.join(told)}): "
         "look at these images if a hand is missing there"
-    ] * bool(told)
+    ] * bool(told) + [
+        "several cameras see hands that do not meet in space: they may be another person's, and mixed up "
+        "with those kept; give a larger `--max-hands` if more people are seen, and check the overlays"
+    ] * often
 
 
 def _are_second(

@@ -18,16 +18,25 @@ def associated(scene: planted.Scene):
     return associate_hands(scene.found, scene.rig, max_hands=scene.max_hands)
 
 
-@pytest.fixture(scope="module")
-def graded():
+def grades_of(seed: int):
     """(kind, rig) -> mistakes and warnings of one scene each."""
     results = {}
     for kind in planted.KINDS:
         for rig in planted.RIGS:
-            scene = planted.planted(kind, rig, 0)
+            scene = planted.planted(kind, rig, seed)
             got = associated(scene)
             results[kind.__name__, rig] = planted.mistakes(scene, got), got.warnings
     return results
+
+
+@pytest.fixture(scope="module")
+def graded():
+    return grades_of(0)
+
+
+def says_that_hands_are_unsure(warnings: tuple[str, ...]) -> bool:
+    """A planted false hand is told of in any case; that is no word about the hands that are kept."""
+    return any(not warning.startswith("what looks like a hand to one camera") for warning in warnings)
 
 
 def test_nearly_all_planted_scenes_come_out_right(graded):
@@ -37,9 +46,23 @@ def test_nearly_all_planted_scenes_come_out_right(graded):
 
 
 def test_no_planted_scene_is_silently_wrong(graded):
-    assert not {
-        place: mistakes for place, (mistakes, warnings) in graded.items() if mistakes and not warnings
+    assert not silently_wrong(graded)
+
+
+def silently_wrong(graded):
+    return {
+        place: mistakes
+        for place, (mistakes, warnings) in graded.items()
+        if mistakes and not says_that_hands_are_unsure(warnings)
     }
+
+
+@pytest.mark.slow
+def test_scenes_of_other_seeds():
+    many = [grades_of(seed) for seed in range(100, 105)]
+    wrong = [place for graded in many for place, (mistakes, _) in graded.items() if mistakes]
+    assert len(wrong) <= 0.05 * sum(map(len, many)), wrong
+    assert not any(map(silently_wrong, many))
 
 
 @pytest.mark.parametrize(
