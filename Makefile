@@ -34,11 +34,14 @@ test-browser: setup
 	@command -v chromium >/dev/null || { apt-get update -qq && apt-get install -y -qq chromium >/dev/null; }
 	$(BIN)/python -m pytest -m browser
 
+# Programs are compiled here as users' are: `make test` spares LLVM its dearest passes.
+AS_USERS := XLA_FLAGS=--xla_force_host_platform_device_count=2
+
 test-parity: setup
-	$(PYTEST) -m parity --dist loadfile
+	$(AS_USERS) $(PYTEST) -m parity --dist loadfile
 
 test-slow: setup
-	$(PYTEST) -m slow
+	$(AS_USERS) $(PYTEST) -m slow
 
 lint: setup
 	$(BIN)/ruff check .

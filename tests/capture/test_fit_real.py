@@ -110,7 +110,7 @@ def test_images_alone_give_the_same_hands(data, tmp_path, folder, most_mm):
     hands = detect_hands(find_frames(data / folder, found_rig.names), found_rig, progress=False)
     assert hands.frames is not None
     assert hands.hand_side == SIDES
-    assert np.isfinite(hands.boxes_px).all()
+    assert (np.isfinite(hands.boxes_px).all(-1).sum(-1) >= 2).all()
     order = [hands.frames.index(name) for name in sorted(hands.frames)]
     assert [int(hands.frames[index]) for index in order] == [int(frame) for frame in frames]
     results = [

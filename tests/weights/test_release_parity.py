@@ -25,6 +25,7 @@ from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.losses import RELEASE, multi_view_losses
+from poem_jax.models.apply import _predict
 from tests.weights.procedural import (
     IMAGE_HW,
     batch_of,
