@@ -10,7 +10,7 @@ def test_what_is_missing_is_said(make_capture, tmp_path):
     capture = make_capture()
     (capture.folder / "boxes.npz").rename(tmp_path / "elsewhere.npz")
     with pytest.raises(
-        FileNotFoundError, match=r"no .*boxes\.npz: say where the hands are: an npz with `boxes_px"
+        FileNotFoundError, match=r"no .*keypoints\.npz: say where the hands are: an npz with `boxes_px"
     ):
         read_take(capture.folder)
     assert len(read_take(capture.folder, boxes=tmp_path / "elsewhere.npz").frames) == 1
