@@ -92,7 +92,10 @@ def projection_jacobian(
     slope = (R[..., :2, :] - xy[..., None] * R[..., 2:, :]) / depth[..., None]
     focal = K[..., None, :2, :2]
     pixels = xp.sum(focal * xy[..., None, :], -1) + K[..., None, :2, 2]
-    return pixels, xp.sum(focal[..., None] * slope[..., None, :, :], -2)
+    # Both terms written out: of their sum over an axis jaxlib 0.10.2 makes a product, which ends the process
+    # on a CPU where hands are mapped over.
+    jacobian = focal[..., :1] * slope[..., None, 0, :] + focal[..., 1:] * slope[..., None, 1, :]
+    return pixels, jacobian
 
 
 def unproject(

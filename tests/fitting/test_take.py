@@ -334,7 +334,6 @@ def test_a_shape_mode_may_be_named():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(run=False, reason="jaxlib's compiler ends the process on the mapped fit: to be mended")
 def test_hands_of_both_sides_may_be_mapped_over(takes):
     models = [keypoint_model(default_hand(side)) for side in ("right", "left")]
     both = [draw_keypoint_take(default_hand(side), 8, 4, 1.0, 13) for side in ("right", "left")]
