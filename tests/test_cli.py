@@ -54,6 +54,14 @@ def test_reconstruct(tmp_path, capsys, checkpoint):
     assert "poem_jax" in report["versions"]
 
 
+@pytest.mark.parametrize("empty", [("--out", ""), ("--out=",)])
+def test_an_empty_option_is_not_the_folder_that_one_is_in(tmp_path, monkeypatch, capsys, empty):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reconstruct", str(demo_folder()), *empty]) == USAGE_ERROR
+    assert capsys.readouterr().err == "poem: error: --out has no value\n"
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_input_is_one_line_and_code_2(tmp_path, capsys, checkpoint):
     command = ["reconstruct", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]
     assert main(command) == USAGE_ERROR == 2

@@ -45,7 +45,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0; or 2, with one line on standard error, for wrong input; or 128 + the number of the signal that came.
     """
-    command = parse(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if empty := _empty_option(arguments):
+        print(f"poem: error: {empty} has no value", file=sys.stderr)
+        return USAGE_ERROR
+    command = parse(arguments)
     set_up_logging()
     try:
         with stop_on_signals():
@@ -79,6 +83,16 @@ def parse(arguments: Sequence[str]) -> Command:
     command, fields = _cli(own, return_unknown_args=True)
     asked_for_help = ["--help"] if len(own) < len(arguments) else []
     return replace(command, overrides=(*fields, *asked_for_help))
+
+
+def _empty_option(arguments: Sequence[str]) -> str | None:
+    """Return the option with an empty value (a shell's unset variable), which would mean the folder `.`."""
+    for before, argument in zip(("an argument", *arguments), arguments, strict=False):
+        if not argument:
+            return before if before.startswith("-") else "an argument"
+        if argument.startswith("--") and argument.endswith("="):
+            return argument[:-1]
+    return None
 
 
 def _cli(arguments: Sequence[str], **options: Any) -> Any:

@@ -46,9 +46,16 @@ _COMPONENT_SHAPES = {
 }
 _KNUCKLES = (1, 4, 7, 10)
 """First joints of index, middle, little and ring finger in MANO's order."""
+_THUMB = 4
+"""The last of MANO's fingers."""
 _SUM_TOLERANCE = 1e-3
 _EXTENT_M = (0.05, 1.0)
 """Of any hand in metres."""
+_MAX_BONE, _MAX_AWAY = 0.35, 0.25
+"""As shares of the hand's extent: a finger's longest bone, and a joint from the middle of the vertices that
+its weights move. Our own hand has 0.2 and 0.1."""
+_MAX_STEP_M = 0.1
+"""By which a shape coefficient of 1, or a turn of one radian, moves a vertex of any hand at most."""
 _CLEAR_AGREEMENT = 0.3
 """Beyond this, `_agreement_of_length_and_width` tells: +0.80 for our own hand, -0.80 with the fault, and
 0 +- 0.3 for shape directions of random numbers."""
@@ -218,6 +225,12 @@ def _check_faces(faces: np.ndarray, source: str) -> None:
             f"`f` in {source} must hold vertex numbers 0..{NUM_VERTICES - 1}; "
             f"got {faces.min()}..{faces.max()}"
         )
+    a, b, c = faces.T
+    if (flat := (a == b) | (b == c) | (c == a)).any():
+        raise ValueError(
+            f"`f` in {source} must hold three vertices a face; {flat.sum()} faces name one twice, the first "
+            f"is {faces[flat.argmax()].astype(int).tolist()}"
+        )
 
 
 def _kind(value: Any) -> str:
@@ -242,7 +255,48 @@ def _check_values(arrays: Mapping[str, np.ndarray], tree: Any, source: str) -> N
                 f"rows of `{name}` in {source} must sum to 1; "
                 f"got sums from {sums.min():.4g} to {sums.max():.4g}"
             )
+    for name in ("shapedirs", "posedirs"):
+        step = np.linalg.norm(arrays[name].astype(float), axis=1).max()
+        if step > _MAX_STEP_M:
+            raise ValueError(
+                f"`{name}` in {source} must be in metres; got steps of up to {step:.3g}. "
+                "Is it in another unit than `v_template`?"
+            )
     _check_tree(tree, source)
+    _check_joints(arrays, extent, source)
+
+
+def _check_joints(arrays: Mapping[str, np.ndarray], extent_m: float, source: str) -> None:
+    """The joints must come in MANO's order, in `J_regressor` and in `weights` alike."""
+    v_template, weights = (arrays[name].astype(float) for name in ("v_template", "weights"))
+    joints = arrays["J_regressor"].astype(float) @ v_template
+    child = np.array([joint for joint, parent in enumerate(MANO_PARENTS) if parent > 0])
+    bones = np.linalg.norm(joints[child] - joints[np.array(MANO_PARENTS)[child]], axis=1) / extent_m
+    index, middle, little, ring = joints[list(_KNUCKLES)]
+    across = np.array([index, middle, ring, little]) @ (little - index)
+    base, _, last = np.linalg.norm(joints[1:] - joints[0], axis=1).reshape(-1, 3).T
+    got = None
+    if bones.max() > _MAX_BONE:
+        joint = child[bones.argmax()]
+        got = f"{bones.max():.0%} of the hand's length from joint {joint} to the one before it in its finger"
+    elif (base > last).any():
+        got = "the base of a finger farther from the wrist than its last joint"
+    elif base[_THUMB] > base.min():
+        got = "a knuckle nearer to the wrist than the base of the thumb"
+    elif (np.diff(across) < 0).any():
+        got = "knuckles in another order across the palm"
+    if got is not None:
+        raise ValueError(
+            f"`J_regressor` in {source} must give the joints in MANO's order (wrist; index, middle, little, "
+            f"ring finger, thumb, each from its base); got {got}"
+        )
+    moved = weights.T @ v_template / np.maximum(weights.sum(0), 1e-9)[:, None]
+    away = np.linalg.norm(moved - joints, axis=1)[1:] / extent_m
+    if away.max() > _MAX_AWAY:
+        raise ValueError(
+            f"the columns of `weights` in {source} must come in the order of the rows of `J_regressor`; got "
+            f"weights of joint {away.argmax() + 1} about a place {away.max():.0%} of the hand's length away"
+        )
 
 
 def _check_tree(tree: Any, source: str) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from poem_jax.capture.boxes_file import read_boxes
+from poem_jax.capture.boxes_file import HandBoxes, read_boxes
 from poem_jax.capture.detect import detect_hands
 from poem_jax.capture.folder import find_frames
 from poem_jax.capture.lens import project_raw
@@ -46,6 +46,13 @@ def seen(rig, hand_world):
         ]
 
     return detector
+
+
+@pytest.fixture
+def hand_boxes(rig):
+    """What a search found in one frame."""
+    boxes = np.tile([10.0, 10.0, 90.0, 90.0], (1, 1, rig.num_views, 1))
+    return HandBoxes(boxes, ("right",), ("0",), cameras=rig.names)
 
 
 def test_hands_go_to_their_frame_and_view(capture, rig, seen, hand_world, caplog):
@@ -121,6 +128,24 @@ def test_a_search_that_is_stopped_too_early_writes_nothing(capture, rig, seen, c
         detect_hands(capture, rig, detector=disagreeing, when_stopped=kept.append, progress=False)
     assert kept == []
     assert "nothing is written of the frames that were searched" in caplog.text
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_part_of_a_search_replaces_no_whole_one(make_capture, monkeypatch, capsys, hand_boxes, earlier):
+    def stopped(*_, when_stopped, **__):
+        when_stopped(hand_boxes)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("poem_jax.capture.detect.detect_hands", stopped)
+    folder = make_capture().folder
+    out, part = folder / "found.npz", folder / "found.part.npz"
+    if earlier:
+        out.write_bytes(b"whole")
+    assert main(["detect", str(folder), "--out", str(out)]) == 130
+    written = part if earlier else out
+    assert read_boxes(written).frames == hand_boxes.frames
+    assert f"what was done so far is in {written}" in capsys.readouterr().err
+    assert not earlier or out.read_bytes() == b"whole"
 
 
 def test_no_hand_at_all_is_an_error(capture, rig):

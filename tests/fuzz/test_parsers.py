@@ -91,12 +91,12 @@ def npz(**arrays: np.ndarray) -> bytes:
 def hand() -> dict[str, Any]:
     """Fields of MANO, small where they can be: what is not structure is all zeros, but for its length."""
     return {
-        "v_template": np.eye(778, 3, dtype=np.float16) / 8,
+        "v_template": np.eye(778, 3, -775, dtype=np.float16) / 8,
         "shapedirs": np.zeros((778, 3, 10), np.float16),
         "posedirs": np.zeros((778, 3, 135), np.float16),
         "J_regressor": np.eye(16, 778),
         "weights": np.eye(1, 16).repeat(778, 0),
-        "f": np.zeros((1538, 3), np.uint16),
+        "f": np.tile(np.arange(3, dtype=np.uint16), (1538, 1)),
         "hands_mean": np.zeros(45),
         "hands_components": np.zeros((45, 45), np.float16),
         "kintree_table": np.stack([[4294967295, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14], range(16)]),

@@ -34,6 +34,14 @@ def _fields() -> dict:
     }
 
 
+_OTHER_ORDER = [0, 13, 14, 15, 1, 2, 3, 4, 5, 6, 10, 11, 12, 7, 8, 9]
+"""Wrist, then thumb to little finger."""
+
+
+def _dense(name: str) -> np.ndarray:
+    return np.asarray(getattr(default_hand(), name), np.float64)
+
+
 def _same(got: HandModel, side: str = "right") -> None:
     assert got.side == side
     for name, a, b in zip(HandModel._fields, got, default_hand(), strict=True):
@@ -194,6 +202,19 @@ def test_reads_the_reference_asset(shared_dir: Path):
         ({"f": np.full((1538, 3), 2**32, np.int64)}, r"`f` .* vertex numbers 0\.\.777; got 4294967296"),
         ({"f": np.full((1538, 3), np.nan)}, r"`f` .* vertex numbers 0\.\.777; got nan"),
         ({"f": np.full((1538, 3), 0.5)}, r"`f` .* vertex numbers 0\.\.777; got 0\.5"),
+        ({"f": np.array([[0, 1, 2]] * 1537 + [[3, 4, 3]])}, r"`f` .*; 1 faces .* the first is \[3, 4, 3\]"),
+        ({"shapedirs": 1000 * _fields()["shapedirs"]}, r"`shapedirs` .* must be in metres.*another unit"),
+        ({"posedirs": 1000 * _fields()["posedirs"]}, r"`posedirs` .* must be in metres.*another unit"),
+        *(
+            ({"J_regressor": _dense("J_regressor")[order]}, f"`J_regressor` .* MANO's order .*{got}")
+            for order, got in [
+                ([0, 3, 2, 1, *range(4, 16)], "the base of a finger farther from the wrist"),
+                (list(range(15, -1, -1)), "of the hand's length from joint"),
+                (_OTHER_ORDER, "a knuckle nearer to the wrist"),
+                ([*range(7), 10, 11, 12, 7, 8, 9, 13, 14, 15], "knuckles in another order across the palm"),
+            ]
+        ),
+        ({"weights": _dense("weights")[:, _OTHER_ORDER]}, "columns of `weights` .* order of the rows"),
         ({"weights": None}, "missing: weights"),
     ],
 )
