@@ -2,8 +2,9 @@
 
 FOLDER holds photographs (.jpg, .png), looked through at any depth. MediaPipe runs in a process of its own,
 in the environment whose interpreter `--mediapipe PYTHON` names (it does not go together with ours); without
-it our figures stand alone. Both get decoded RGB images and look at each by itself, at most two hands, the
-full models; they take turns image by image, and medians over the images are compared.
+it our figures stand alone. Both look at RGB images that they have just decoded, each by itself, for at most
+two hands, with the full models. They take turns, all images each (with turns image by image the threads of
+one still wait for work while the other is timed), and the medians over the turns are compared.
 """
 
 import argparse
@@ -71,8 +72,9 @@ def mediapipe(python: str | None) -> Iterator[Mediapipe | None]:
         process.stdin.close()
 
 
-def our_time(image: np.ndarray) -> float:
-    """Return the seconds that an image takes here."""
+def our_time(path: Path) -> float:
+    """Return the seconds that an image takes here, once it is read."""
+    image = read_image(path)
     start = time.perf_counter()
     find_hands([image])
     return time.perf_counter() - start
@@ -91,17 +93,15 @@ def main() -> None:
     paths = paths[:: max(1, len(paths) // options.images)][: options.images]
     if not paths:
         sys.exit(f"no images in {options.folder}")
-    images = [read_image(path) for path in paths]
-    print(f"first call, compiled or read from the cache: {our_time(images[0]):.1f} s")
+    print(f"first call, compiled or read from the cache: {our_time(paths[0]):.1f} s")
     ours, theirs = (np.full((options.rounds, len(paths)), np.nan) for _ in range(2))
     with mediapipe(options.mediapipe) as rival:
         if rival is not None:
             rival.time(paths[0])
         for turn in range(options.rounds):
-            for index, (path, image) in enumerate(zip(paths, images, strict=True)):
-                ours[turn, index] = our_time(image)
-                if rival is not None:
-                    theirs[turn, index] = rival.time(path)
+            ours[turn] = [our_time(path) for path in paths]
+            if rival is not None:
+                theirs[turn] = [rival.time(path) for path in paths]
     ours, theirs = np.median(ours, 0), np.median(theirs, 0)
     print(f"{len(paths)} images, median of {options.rounds} turns each")
     print(f"poem_jax   {1000 * np.median(ours):6.1f} ms an image (median), {1000 * ours.mean():6.1f} (mean)")

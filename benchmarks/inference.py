@@ -321,7 +321,8 @@ def _trunk(prepared, images):
 
 def _branches(prepared, levels):
     model, levels = _module(prepared), tuple(levels)
-    return model.heat_maps(levels, _mode()), model.features(levels, _mode())
+    keypoints_px, heat_maps = model.heat_maps(levels, _mode())
+    return keypoints_px, heat_maps, model.features(levels, heat_maps, _mode())
 
 
 def _read(prepared, inputs):

@@ -38,9 +38,6 @@ class Operator(NamedTuple):
     activation: str | None
     constants: tuple[np.ndarray, ...]
     """Inputs that are stored in the file, in order, 16-bit numbers made 32-bit."""
-    inputs: tuple[int, ...]
-    """Numbers of the maps that go in."""
-    outputs: tuple[int, ...]
 
 
 class Table:
@@ -107,8 +104,7 @@ def read_operators(data: bytes) -> Iterator[Operator]:
             continue
         stored |= {index: unpacked[index] for index in inputs if index in unpacked}
         constants = tuple(array for array in stored.values() if array is not None)
-        maps = tuple(index for index in inputs if stored[index] is None)
-        yield Operator(kind, *_options(kind, table.table(4)), constants, maps, outputs)
+        yield Operator(kind, *_options(kind, table.table(4)), constants)
 
 
 def _stored(tensor: Table, buffers: list[Table]) -> np.ndarray | None:

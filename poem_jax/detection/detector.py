@@ -5,7 +5,7 @@ program depends on the size of an image or on how many hands it shows, and littl
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -14,11 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from poem_jax.detection.landmark_network import INPUT_SIZE as LANDMARK_SIZE
 from poem_jax.detection.landmark_network import Landmarks, landmark_network
+from poem_jax.detection.palm_network import INPUT_SIZE as PALM_SIZE
 from poem_jax.detection.palm_network import palm_network
 from poem_jax.detection.palms import find_palms, letterbox
 from poem_jax.detection.regions import Region, cut_out, into_image, overlap, region_of_hand, region_of_palm
 from poem_jax.detection.stored_weights import landmark_weights, palm_weights
+from poem_jax.io.compiler_options import cpu_options
 from poem_jax.typing import Array, Float, UInt8
 
 MIN_PRESENCE = 0.5
@@ -32,7 +35,6 @@ _MAX_SIDE = 2**15 - 2
 """Of an image, pixels: OpenCV takes pictures by places of 16 bits."""
 _BATCH = 8
 """Pictures that a program takes on an accelerator."""
-_ONE_THREAD = {"xla_cpu_multi_thread_eigen": False}
 
 
 class DetectedHand(NamedTuple):
@@ -108,9 +110,9 @@ def _check(images: Sequence[Any], max_hands: int) -> None:
 
 def _regions_of_palms(images: Sequence[Array], max_hands: int) -> list[list[Region]]:
     """Return where hands may be in every image."""
-    pictures = [letterbox(image) for image in images]
+    seen = _palm_program()([partial(letterbox, image) for image in images])
     regions = []
-    for image, logits, guesses in zip(images, *_palm_program()(pictures), strict=True):
+    for image, logits, guesses in zip(images, *seen, strict=True):
         palms = find_palms(logits, guesses, image.shape[:2])[:max_hands]
         regions.append(_without_doubles([region_of_palm(palm) for palm in palms]))
     return regions
@@ -122,7 +124,7 @@ def _look(images: Sequence[Array], regions: Sequence[Sequence[Region]]) -> list[
     hands: list[list[DetectedHand]] = [[] for _ in images]
     if not places:
         return hands
-    pictures = [cut_out(images[number], region) for number, region in places]
+    pictures = [partial(cut_out, images[number], region) for number, region in places]
     seen = Landmarks(*_landmark_program()(pictures))
     for (number, region), points, presence, right in zip(places, *seen, strict=True):
         if presence > MIN_PRESENCE:
@@ -145,45 +147,53 @@ def _without_doubles(regions: Sequence[Region]) -> list[Region]:
 class _Program:
     """A network with its weights, compiled for one picture (CPU) or eight (accelerators) at a time."""
 
-    def __init__(self, network: Any, weights: Any) -> None:
+    def __init__(self, network: Any, weights: Any, size: int) -> None:
+        """`size`: pixels along a side of its pictures."""
+
         def run(weights: Any, pictures: Array) -> Any:
             return network(weights, pictures.astype(jnp.float32) / 255)
 
         self._weights = jax.device_put(weights)
-        self._alone = jax.jit(run)
-        self._one_thread = jax.jit(run, compiler_options=_ONE_THREAD)
-        self._compiled: Any = None
+        self._size, self._network = size, run
+        self._compiled: dict[bool, Any] = {}
 
-    def __call__(self, pictures: Sequence[UInt8[Array, "size size 3"]]) -> list[Array]:
-        """Run the network; on a CPU several pictures side by side, one thread each."""
+    def __call__(self, pictures: Sequence[Callable[[], UInt8[Array, "size size 3"]]]) -> list[Array]:
+        """Make the pictures and run the network on them; on a CPU several side by side, one thread each."""
         on_cpu = jax.default_backend() == "cpu"
-        size = 1 if on_cpu else _BATCH
-        groups = [pictures[start : start + size] for start in range(0, len(pictures), size)]
-        if on_cpu and len(groups) > 1:
-            program = self._beside_others(pictures[0].shape)
+        number = 1 if on_cpu else _BATCH
+        groups = [pictures[start : start + number] for start in range(0, len(pictures), number)]
+        beside_others = on_cpu and len(groups) > 1
+        # Compiled before several threads ask for it.
+        program = self._program(number, beside_others)
+        run = partial(self._filled, program, number)
+        if beside_others:
             with ThreadPoolExecutor(min(len(groups), os.cpu_count() or 1)) as pool:
-                parts = list(pool.map(partial(self._run, program, size), groups))
+                parts = list(pool.map(run, groups))
         else:
-            parts = [self._run(self._alone, size, group) for group in groups]
+            parts = [run(group) for group in groups]
         return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
-    def _beside_others(self, shape: tuple[int, ...]) -> Any:
-        """Return the program that takes one thread, compiled before several threads ask for it."""
-        if self._compiled is None:
-            picture = jax.ShapeDtypeStruct((1, *shape), jnp.uint8)
-            self._compiled = self._one_thread.lower(self._weights, picture).compile()
-        return self._compiled
+    def _program(self, number: int, beside_others: bool) -> Any:
+        """Return the compiled program, that takes one thread where several run side by side."""
+        if beside_others not in self._compiled:
+            options = cpu_options(one_thread=beside_others) if jax.default_backend() == "cpu" else None
+            jitted = jax.jit(self._network, compiler_options=options)
+            pictures = jax.ShapeDtypeStruct((number, self._size, self._size, 3), jnp.uint8)
+            self._compiled[beside_others] = jitted.lower(self._weights, pictures).compile()
+        return self._compiled[beside_others]
 
-    def _run(self, program: Any, size: int, group: Sequence[Array]) -> list[Array]:
-        filled = np.stack([*group, *[group[-1]] * (size - len(group))])
+    def _filled(self, program: Any, number: int, group: Sequence[Callable[[], Array]]) -> list[Array]:
+        """Run it on pictures repeated to the number that it takes."""
+        made = [make() for make in group]
+        filled = np.stack([*made, *made[-1:] * (number - len(made))])
         return [np.asarray(out)[: len(group)] for out in program(self._weights, filled)]
 
 
 @cache
 def _palm_program() -> _Program:
-    return _Program(palm_network, palm_weights())
+    return _Program(palm_network, palm_weights(), PALM_SIZE)
 
 
 @cache
 def _landmark_program() -> _Program:
-    return _Program(landmark_network, landmark_weights())
+    return _Program(landmark_network, landmark_weights(), LANDMARK_SIZE)

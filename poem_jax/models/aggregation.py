@@ -24,6 +24,7 @@ class ProjectiveAggregation(nnx.Module):
 
     def __init__(self, config: AggregationConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.is_release = config.design is Design.RELEASE
+        self.all_alike = config.similarity is Similarity.EQUAL
         half = width // 2
         self.theta_in, self.theta_out = linear(width, width, rngs=rngs), linear(width, half, rngs=rngs)
         hidden = half if self.is_release else width
@@ -52,6 +53,8 @@ class ProjectiveAggregation(nnx.Module):
 
     def _fused(self, features: Array, view_mask: Array, primary: Array) -> Float[Array, "batch point c"]:
         theta = self.theta_out(jax.nn.relu(self.theta_in(features)))
+        if self.all_alike:
+            return _mean(features, view_mask) + self._phi(_mean(theta, view_mask))
         first = _view(theta, primary)
         source_mask = view_mask & (jnp.arange(view_mask.shape[-1]) != primary[:, None])
         similarity = self.similarity_scale * jnp.sum(theta * first[:, None], -1)
@@ -63,8 +66,11 @@ class ProjectiveAggregation(nnx.Module):
     def _update(self, from_sources: Array, first: Array, count: Array) -> Float[Array, "batch point c"]:
         if self.is_release:
             from_sources = jnp.where(count == 1, first, from_sources)
-        update = self.phi_out(jax.nn.relu(self.phi_in(from_sources))) / jnp.maximum(count, 1)
+        update = self._phi(from_sources) / jnp.maximum(count, 1)
         return update if self.is_release else jnp.where(count > 1, update, 0)
+
+    def _phi(self, tokens: Array) -> Float[Array, "batch point c"]:
+        return self.phi_out(jax.nn.relu(self.phi_in(tokens)))
 
 
 def row_major_tokens(
@@ -86,3 +92,11 @@ def _view(
     values: Float[Array, "batch view basis c"], index: Int[Array, " batch"]
 ) -> Float[Array, "batch basis c"]:
     return jnp.take_along_axis(values, index[:, None, None, None], axis=1)[:, 0]
+
+
+def _mean(
+    values: Float[Array, "batch view basis c"], view_mask: Bool[Array, "batch view"]
+) -> Float[Array, "batch basis c"]:
+    """Average over the valid views; zero where there is none."""
+    weights = view_mask / jnp.maximum(jnp.sum(view_mask, -1, keepdims=True), 1)
+    return jnp.sum(weights[..., None, None].astype(values.dtype) * values, 1)

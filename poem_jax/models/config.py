@@ -196,6 +196,9 @@ class FeatureConfig:
     add the coarser map, to the coarsest, then enlarge once; sines of the number of the view, the row and the
     column are mixed and added to the map; points behind a camera sample where they project through its
     centre."""
+    heat_maps: bool = False
+    """The joints' heat maps are mixed into the feature map: a basis point then knows what each view says of
+    every joint at its place, and not only where the views' expectations meet."""
 
 
 class BasisSampling(enum.StrEnum):
@@ -231,6 +234,8 @@ class Similarity(enum.StrEnum):
     """theta(f1) . theta(fj), as the paper writes it."""
     MEAN = "mean"
     """The same divided by its number of terms, so that its size does not grow with the width."""
+    EQUAL = "equal"
+    """All valid views alike, the primary too: mean_j fj + phi(mean_j theta(fj))."""
 
 
 @dataclass(frozen=True)
@@ -241,6 +246,12 @@ class AggregationConfig:
     design: Design = Design.PAPER
     """The release reads its samples, (view, channel, point) in memory, as (point, view, channel), which mixes
     them; one view alone gets phi(theta(f1)) added; phi's hidden layer is as narrow as its input."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.design is Design.PAPER or self.similarity is not Similarity.EQUAL,
+            "`aggregation.similarity` = equal needs `aggregation.design` = paper",
+        )
 
 
 class NeighbourSearch(enum.StrEnum):
@@ -362,6 +373,12 @@ class Config:
             self.features.design is Design.PAPER or self.features.stride == strides[-2],
             f"`features.stride` must be {strides[-2]} with `features.design` = release, which enlarges the "
             f"trunk's coarsest map once; got {self.features.stride}",
+        )
+        require(
+            not self.features.heat_maps
+            or (self.features.design is Design.PAPER and self.features.stride == self.root.stride),
+            "`features.heat_maps` needs `features.design` = paper and maps of one stride; got "
+            f"`features.stride` = {self.features.stride}, `root.stride` = {self.root.stride}",
         )
         require(
             self.width % (4 * self.decoder.num_heads) == 0,

@@ -24,6 +24,7 @@ import numpy as np
 
 from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras
+from poem_jax.io.compiler_options import cpu_options
 from poem_jax.models import network
 from poem_jax.models.apply import check_inputs, check_solved
 from poem_jax.models.config import Config
@@ -35,8 +36,6 @@ from poem_jax.typing import Array, Float, Num, Params
 
 _VIEWS_AT_A_TIME = 8
 """Views that an accelerator takes at a time."""
-_ONE_THREAD = {"xla_cpu_multi_thread_eigen": False}
-"""Compiler option for programs of which several run side by side."""
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["params", "first"], meta_fields=["config"])
@@ -143,9 +142,13 @@ def _run_all(function: Callable, prepared: Prepared, parts: list) -> list:
     otherwise, and on accelerators, one after the other.
     """
     cores = _cores()
-    if not _on_cpu() or 2 * len(parts) <= cores:
+    if not _on_cpu():
         return [function(prepared, part) for part in parts]
-    program, settings = _one_thread(function), _thread_settings()
+    side_by_side = 2 * len(parts) > cores
+    program = _cpu_program(function, side_by_side)
+    if not side_by_side:
+        return [program(prepared, part) for part in parts]
+    settings = _thread_settings()
 
     def work(part: Any) -> Any:
         with contextlib.ExitStack() as stack:
@@ -193,9 +196,10 @@ def _find(prepared: Prepared, samples: tuple[ViewFeatures, WorkingFrame]) -> Pre
 
 
 @functools.cache
-def _one_thread(function: Callable) -> Callable:
-    """Return a jitted function compiled to run in one thread."""
-    return jax.jit(function.__wrapped__, compiler_options=_ONE_THREAD)  # pyright: ignore[reportFunctionMemberAccess]
+def _cpu_program(function: Callable, one_thread: bool) -> Callable:
+    """Return a jitted function compiled anew for a CPU."""
+    plain = function.__wrapped__  # pyright: ignore[reportFunctionMemberAccess]
+    return jax.jit(plain, compiler_options=cpu_options(one_thread=one_thread))
 
 
 @functools.partial(jax.jit, static_argnames="config")

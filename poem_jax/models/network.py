@@ -145,7 +145,8 @@ class Poem(nnx.Module):
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
         """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
         levels = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
-        seen = ViewFeatures(*self.heat_maps(levels, mode), self.features(levels, mode))
+        keypoints_px, heat_maps = self.heat_maps(levels, mode)
+        seen = ViewFeatures(keypoints_px, heat_maps, self.features(levels, heat_maps, mode))
         return ViewFeatures(*(leaf.reshape(*views.shape[:-3], *leaf.shape[1:]) for leaf in seen))
 
     def find_hands(

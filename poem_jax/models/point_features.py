@@ -16,6 +16,8 @@ from poem_jax.models.layers import Conv, ConvNorm, NormMode, TopDownBranch, doub
 from poem_jax.typing import Array, Bool, Float
 
 _TEMPERATURE = 10000.0
+_MIN_HEAT, _EVIDENCE_SCALE = 0.01, 0.25
+"""Of an even map's heat, and what brings the logarithms to between -1.2 and 1.7."""
 _EPSILON = 1e-6
 """Added by the release to the number of views, rows and columns that its positions are divided by."""
 
@@ -30,18 +32,28 @@ class FeatureBranch(nnx.Module):
             self.branch = BottomUpBranch(trunk.channels, bias=True, rngs=rngs)
         else:
             self.branch = TopDownBranch(trunk.channels, trunk.strides, features.stride, rngs=rngs)
-        self.project = Conv(self.branch.c_out, config.width, 1, bias=True, rngs=rngs)
+        self.num_joints = config.root.num_joints if features.heat_maps else 0
+        self.project = Conv(self.branch.c_out + self.num_joints, config.width, 1, bias=True, rngs=rngs)
         self.position = ViewRowColumnCode(config.width, rngs=rngs) if is_release else None
 
-    def __call__(self, levels: tuple[Array, ...], mode: NormMode) -> Float[Array, "image h w c"]:
+    def __call__(
+        self, levels: tuple[Array, ...], heat_maps: Float[Array, "image joint h2 w2"], mode: NormMode
+    ) -> Float[Array, "image h w c"]:
         """Return the feature maps."""
-        return self.project(self.branch(levels, mode))
+        x = self.branch(levels, mode)
+        return self.project(jnp.concatenate([x, evidence(heat_maps)], -1) if self.num_joints else x)
 
     def with_position(
         self, maps: Float[Array, "batch view h w c"], view_mask: Bool[Array, "batch view"]
     ) -> Float[Array, "batch view h w c"]:
         """Add the position code, if it belongs to the map."""
         return maps if self.position is None else maps + self.position(view_mask, maps.shape[2:4])
+
+
+def evidence(heat_maps: Float[Array, "image joint h w"]) -> Float[Array, "image h w joint"]:
+    """Return the logarithm of each map over an even one: where it says nothing zero, as beyond the border."""
+    cells = heat_maps.shape[-2] * heat_maps.shape[-1]
+    return jnp.moveaxis(jnp.log(cells * heat_maps + _MIN_HEAT) * _EVIDENCE_SCALE, -3, -1)
 
 
 class BottomUpBranch(nnx.Module):

@@ -12,9 +12,18 @@ MASK = np.array([[True] * 4, [False, True, True, False], [False, False, True, Fa
 PRIMARY = np.array([0, 1, 2])
 
 
+def _module(similarity):
+    return ProjectiveAggregation(AggregationConfig(similarity=similarity), WIDTH, rngs=nnx.Rngs(0))
+
+
 @pytest.fixture(params=list(Similarity))
 def module(request):
-    return ProjectiveAggregation(AggregationConfig(similarity=request.param), WIDTH, rngs=nnx.Rngs(0))
+    return _module(request.param)
+
+
+@pytest.fixture(params=[Similarity.DOT, Similarity.MEAN])
+def projective(request):
+    return _module(request.param)
 
 
 def _naive(module, features, mask, primary):
@@ -39,13 +48,26 @@ def _naive(module, features, mask, primary):
     return np.array(fused)
 
 
-def test_equation_8(module):
-    expected = _naive(module, FEATURES, MASK, PRIMARY)
-    np.testing.assert_allclose(module(FEATURES, MASK, PRIMARY), expected, atol=1e-5)
+def test_equation_8(projective):
+    expected = _naive(projective, FEATURES, MASK, PRIMARY)
+    np.testing.assert_allclose(projective(FEATURES, MASK, PRIMARY), expected, atol=1e-5)
 
 
-def test_one_view_passes_exactly(module):
-    np.testing.assert_array_equal(module(FEATURES, MASK, PRIMARY)[2], FEATURES[2, 2])
+def test_one_view_passes_exactly(projective):
+    np.testing.assert_array_equal(projective(FEATURES, MASK, PRIMARY)[2], FEATURES[2, 2])
+
+
+def test_without_a_similarity_all_views_are_alike():
+    module, order = _module(Similarity.EQUAL), np.array([2, 0, 3, 1])
+    fused = module(FEATURES, MASK, PRIMARY)
+    np.testing.assert_allclose(fused, module(FEATURES[:, order], MASK[:, order], PRIMARY), atol=1e-6)
+    doubled = np.concatenate([FEATURES, FEATURES], 1), np.concatenate([MASK, MASK], 1)
+    np.testing.assert_allclose(fused, module(*doubled, PRIMARY), atol=1e-6)
+    mean = FEATURES[1, 1:3].mean(0)
+    module.phi_out.kernel, module.phi_out.bias = (
+        0 * part[...] for part in (module.phi_out.kernel, module.phi_out.bias)
+    )
+    np.testing.assert_allclose(module(FEATURES, MASK, PRIMARY)[1], mean, atol=1e-6)
 
 
 def test_masked_views_do_not_matter(module):

@@ -5,14 +5,17 @@ from pathlib import Path
 import pytest
 
 from poem_jax.models.config import (
+    AggregationConfig,
     BasisConfig,
     Config,
     DecoderConfig,
+    Design,
     FeatureConfig,
     FirstQueries,
     HRNetConfig,
     ResNetConfig,
     RootConfig,
+    Similarity,
 )
 from poem_jax.models.presets import PRESETS, preset
 from poem_jax.weights.config_json import from_json, to_json
@@ -47,9 +50,35 @@ def test_unknown_trunk_fails():
 def test_unknown_choice_fails():
     text = json.loads(to_json(preset("tiny")))
     text["aggregation"]["similarity"] = "cosine"
-    message = r"`config.aggregation.similarity` must be one of \['dot', 'mean'\]; got 'cosine'"
+    message = r"`config.aggregation.similarity` must be one of \['dot', 'mean', 'equal'\]; got 'cosine'"
     with pytest.raises(ValueError, match=message):
         from_json(json.dumps(text))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"features": FeatureConfig(stride=8, heat_maps=True), "root": RootConfig(stride=4)},
+            "maps of one stride",
+        ),
+        (
+            {
+                "features": FeatureConfig(stride=16, design=Design.RELEASE, heat_maps=True),
+                "root": RootConfig(stride=16),
+            },
+            r"`features\.heat_maps` needs `features\.design` = paper",
+        ),
+    ],
+)
+def test_heat_maps_join_only_features_like_them(change, message):
+    with pytest.raises(ValueError, match=message):
+        Config(**change)
+
+
+def test_equal_views_are_the_papers():
+    with pytest.raises(ValueError, match=r"needs `aggregation\.design` = paper"):
+        AggregationConfig(similarity=Similarity.EQUAL, design=Design.RELEASE)
 
 
 EARLIER = json.loads((Path(__file__).parent / "configs_of_earlier_versions.json").read_text())

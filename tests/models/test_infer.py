@@ -13,6 +13,7 @@ from poem_jax.models.config import AggregationConfig, DecoderOutput, Design, Fea
 from poem_jax.models.infer import infer, prepare
 
 METRES = 2e-5
+METRES_IN_FLOAT64 = 1e-9
 MASK = np.array([[1, 1, 0, 1], [0, 1, 1, 0], [1, 1, 1, 1]], bool)
 
 
@@ -40,17 +41,27 @@ def model(request, make_params, micro_config):
     return config, make_params(config)
 
 
+def in_float64(params):
+    """Call it where float64 is enabled."""
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf, np.float64) if leaf.dtype == np.float32 else leaf, params
+    )
+
+
 def test_infer_finds_what_apply_finds(model, make_scene):
+    """In float64, as random hands are metres large and two programs round them differently."""
     config, params = model
     views, cams = make_scene(3, 4)
     cams = cams._replace(view_mask=MASK)
-    expected = apply(params, views, cams, config=config)
-    found = infer(prepare(params, config), views, cams)
+    with jax.enable_x64(True):
+        params, views = in_float64(params), views / 255.0
+        expected = apply(params, views, cams, config=config)
+        found = infer(prepare(params, config), views, cams)
     assert found._fields == expected._fields
     for name in ("vertices_world", "joints_world", "root_world", "layers_world", "translation", "shape"):
         if getattr(expected, name) is not None:
             wanted = getattr(expected, name)
-            np.testing.assert_allclose(getattr(found, name), wanted, atol=METRES, err_msg=name)
+            np.testing.assert_allclose(getattr(found, name), wanted, atol=METRES_IN_FLOAT64, err_msg=name)
     np.testing.assert_array_equal(found.valid, expected.valid)
     np.testing.assert_allclose(found.keypoints_px[MASK], expected.keypoints_px[MASK], atol=1e-3)
     assert not np.any(found.keypoints_px[~MASK])
@@ -96,11 +107,7 @@ def test_threads_keep_the_settings_of_the_caller(micro_config, make_params, make
     monkeypatch.setattr(inference, "_cores", lambda: 2)
     views, cams = make_scene(2, 4)
     with jax.enable_x64(True):
-        double = jax.tree.map(
-            lambda leaf: leaf.astype(np.float64) if leaf.dtype == np.float32 else leaf,
-            make_params(micro_config),
-        )
-        found = infer(prepare(double, micro_config), views / 255.0, cams)
+        found = infer(prepare(in_float64(make_params(micro_config)), micro_config), views / 255.0, cams)
     assert found.vertices_world.dtype == np.float64
 
 
@@ -109,8 +116,9 @@ def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkey
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
     infer(prepared, views, cams._replace(view_mask=MASK))
-    jitted = [inference._one_thread(inference._look), inference._one_thread(inference._find)]
-    jitted += [inference._look, inference._find, inference._write, inference._read]
+    halves = (inference._look, inference._find)
+    jitted = [inference._cpu_program(half, alone) for half in halves for alone in (True, False)]
+    jitted += [inference._write, inference._read]
     before = [program._cache_size() for program in jitted]
     for mask in (~MASK | np.array([True, True, False, False]), np.ones((3, 4), bool)):
         infer(prepared, views, cams._replace(view_mask=mask))

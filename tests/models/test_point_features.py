@@ -4,7 +4,7 @@ import pytest
 
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.models.config import BasisConfig, BasisSampling
-from poem_jax.models.point_features import basis_points, projected_features
+from poem_jax.models.point_features import basis_points, evidence, projected_features
 
 
 @pytest.mark.parametrize(("sampling", "mean_radius"), [("ball", 0.075), ("gaussian", 0.0655)])
@@ -59,3 +59,15 @@ def test_the_release_reads_through_the_camera(ramp):
     back, _ = projected_features(maps, cams, -points, (32, 32), zeros_behind=False)
     assert np.any(front)
     np.testing.assert_allclose(front, back, atol=1e-4)
+
+
+def test_evidence_is_nothing_where_a_map_is_even_or_ends():
+    heat = np.full((1, 3, 4, 4), 1 / 16, np.float32)
+    heat[0, 1], heat[0, 1, 2, 3] = 0, 1
+    heat[0, 2, 0, 0] = 2 / 16
+    seen = np.asarray(evidence(jnp.asarray(heat)))
+    assert seen.shape == (1, 4, 4, 3)
+    np.testing.assert_allclose(seen[..., 0], 0, atol=0.01)
+    assert np.unravel_index(seen[0, ..., 1].argmax(), (4, 4)) == (2, 3)
+    assert np.isfinite(seen).all()
+    np.testing.assert_allclose(seen[0, 0, 0, 2] - seen[0, 1, 1, 2], np.log(2) / 4, rtol=0.01)
