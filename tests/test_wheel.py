@@ -93,6 +93,14 @@ def test_fit(run, tmp_path):
     assert (tmp_path / "out" / "prediction.npz").is_file()
 
 
+def test_images_and_a_rig_are_all_that_is_needed(run, shared_dir, tmp_path):
+    """Detection, association, fit and page, in one command, with real photographs."""
+    take = shared_dir / "data" / "caliscope_4cam_hands"
+    assert "24 of 24 hands in 12 frames" in run("poem", "fit", str(take), "--out", "out")
+    for name in ("keypoints.npz", "prediction.npz", "index.html"):
+        assert (tmp_path / "out" / name).is_file()
+
+
 def test_train_three_steps_and_go_on(run, tmp_path):
     options = ("--train.host-devices", "1", "--train.log-every", "1", "--train.checkpoint-every", "2")
     small = ("--data.batches.0.batch-size", "2", "--data.batches.1.batch-size", "2")

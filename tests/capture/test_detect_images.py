@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.capture.association import associate_hands
 from poem_jax.capture.boxes_file import read_boxes
 from poem_jax.capture.demo import demo_folder
 from poem_jax.capture.folder import find_frames
 from poem_jax.capture.rig_file import read_rig
 from poem_jax.cli import main
-from poem_jax.detection import find_hands
+from poem_jax.detection import HandTracker, find_hands
 from poem_jax.io.images import read_image
 
 CAMERAS = tuple(f"cam_{view}" for view in range(4))
@@ -144,3 +145,35 @@ def test_a_take_without_hands_is_told(take, capsys):
     assert main(["detect", str(folder), "--out", str(folder / "found.npz")]) == 2
     assert "no hand was found in any image of 1 frames" in capsys.readouterr().err
     assert not (folder / "found.npz").exists()
+
+
+@pytest.mark.parity
+def test_hands_are_followed_through_a_video(shared_dir):
+    """Tracking finds what looking at each frame finds, in the same hands."""
+    rig = read_rig(shared_dir / "data" / "caliscope_4cam_hands" / "calibration" / "rig.json")
+    videos = [
+        cv2.VideoCapture(str(shared_dir / "data" / "caliscope_4cam_video" / f"{name}.mp4"))
+        for name in rig.names
+    ]
+    trackers = [HandTracker(2) for _ in videos]
+    static, tracked = [], []
+    while all(video.grab() for video in videos):
+        images = [np.ascontiguousarray(video.retrieve()[1][..., ::-1]) for video in videos]
+        static.append(find_hands(images, max_hands=4))
+        tracked.append([tracker.find_hands(image) for tracker, image in zip(trackers, images, strict=True)])
+    assert len(static) == 34
+    names = tuple(map(str, range(len(static))))
+    each, followed = (
+        associate_hands(found, rig, max_hands=2, frame_names=names) for found in (static, tracked)
+    )
+    assert each.hand_side == followed.hand_side
+    views, followed_views = (
+        np.isfinite(hands.keypoints_px).all((-1, -2)).sum(2) >= 2 for hands in (each, followed)
+    )
+    assert np.all(followed_views[views].mean() >= 0.95)
+    same, other = (
+        np.linalg.norm(each.keypoints_px - keypoints, axis=-1).mean(-1)
+        for keypoints in (followed.keypoints_px, followed.keypoints_px[:, ::-1])
+    )
+    assert not np.any(other < same)
+    assert np.nanmedian(same) < 5
