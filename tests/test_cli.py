@@ -54,12 +54,20 @@ def test_reconstruct(tmp_path, capsys, checkpoint):
     assert "poem_jax" in report["versions"]
 
 
-@pytest.mark.parametrize("empty", [("--out", ""), ("--out=",)])
-def test_an_empty_option_is_not_the_folder_that_one_is_in(tmp_path, monkeypatch, capsys, empty):
+@pytest.mark.parametrize(
+    ("empty", "what"),
+    [(("--out", ""), "an empty argument after '--out'"), (("--out=",), "nothing after '--out='")],
+)
+def test_an_empty_option_is_not_the_folder_that_one_is_in(tmp_path, monkeypatch, capsys, empty, what):
     monkeypatch.chdir(tmp_path)
     assert main(["reconstruct", str(demo_folder()), *empty]) == USAGE_ERROR
-    assert capsys.readouterr().err == "poem: error: --out has no value\n"
+    assert capsys.readouterr().err == f"poem: error: {what}: is a shell variable unset?\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_value_may_end_in_a_sign_of_equality(tmp_path, capsys):
+    assert main(["reconstruct", str(tmp_path / "none"), f"--out={tmp_path}/run="]) == USAGE_ERROR
+    assert "unset" not in capsys.readouterr().err
 
 
 def test_wrong_input_is_one_line_and_code_2(tmp_path, capsys, checkpoint):

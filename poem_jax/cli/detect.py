@@ -70,15 +70,16 @@ def find_keypoints(
     rig = find_rig(folder, rig_file)
     frames = find_frames(folder, rig.names)
     images = [image for frame in frames for image in frame.images]
-    check_inputs_stay([out], [rig_file, *(folder / name for name in RIG_FILES), *images])
-    say(f"looking for hands in {len(frames)} frames of {rig.num_views} cameras")
     # Part of a search does not replace a whole one.
-    part = out.with_name(f"{out.stem}.part{out.suffix}") if out.exists() else out
+    part = out.with_name(f"{out.stem}.part{out.suffix}")
+    check_inputs_stay([out, part], [rig_file, *(folder / name for name in RIG_FILES), *images])
+    say(f"looking for hands in {len(frames)} frames of {rig.num_views} cameras")
     with tells_what_is_left(part):
         hands = detect_hands(
             frames, rig, max_hands=max_hands, video=video, when_stopped=partial(write_boxes, part)
         )
-    write_boxes(out, hands)
+        write_boxes(out, hands)
+    part.unlink(missing_ok=True)
     views = np.isfinite(hands.boxes_px).all(-1).sum(2)
     for name, count in zip(hand_names(hands.hand_side), views.T, strict=True):
         print(f"{name} hand: seen by two views or more in {(count > 1).sum()} of {len(count)} frames")

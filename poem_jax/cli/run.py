@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if empty := _empty_option(arguments):
-        print(f"poem: error: {empty} has no value", file=sys.stderr)
+        print(f"poem: error: {empty}: is a shell variable unset?", file=sys.stderr)
         return USAGE_ERROR
     command = parse(arguments)
     set_up_logging()
@@ -86,12 +86,13 @@ def parse(arguments: Sequence[str]) -> Command:
 
 
 def _empty_option(arguments: Sequence[str]) -> str | None:
-    """Return the option with an empty value (a shell's unset variable), which would mean the folder `.`."""
-    for before, argument in zip(("an argument", *arguments), arguments, strict=False):
+    """Say which argument is empty, as a shell's unset variable is: it would mean the folder `.`."""
+    for before, argument in zip(("", *arguments), arguments, strict=False):
+        name, given, value = argument.partition("=")
         if not argument:
-            return before if before.startswith("-") else "an argument"
-        if argument.startswith("--") and argument.endswith("="):
-            return argument[:-1]
+            return f"an empty argument after {before!r}" if before else "an empty argument"
+        if name.startswith("--") and given and not value:
+            return f"nothing after '{argument}'"
     return None
 
 

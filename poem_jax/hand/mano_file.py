@@ -51,11 +51,8 @@ _THUMB = 4
 _SUM_TOLERANCE = 1e-3
 _EXTENT_M = (0.05, 1.0)
 """Of any hand in metres."""
-_MAX_BONE, _MAX_AWAY = 0.35, 0.25
-"""As shares of the hand's extent: a finger's longest bone, and a joint from the middle of the vertices that
-its weights move. Our own hand has 0.2 and 0.1."""
-_MAX_STEP_M = 0.1
-"""By which a shape coefficient of 1, or a turn of one radian, moves a vertex of any hand at most."""
+_MAX_BONE = 0.35
+"""A finger's longest bone as a share of the hand's extent; our own hand has 0.24."""
 _CLEAR_AGREEMENT = 0.3
 """Beyond this, `_agreement_of_length_and_width` tells: +0.80 for our own hand, -0.80 with the fault, and
 0 +- 0.3 for shape directions of random numbers."""
@@ -256,11 +253,12 @@ def _check_values(arrays: Mapping[str, np.ndarray], tree: Any, source: str) -> N
                 f"got sums from {sums.min():.4g} to {sums.max():.4g}"
             )
     for name in ("shapedirs", "posedirs"):
+        # Moved by more than a hand's length by one coefficient, or by one entry of R - 1.
         step = np.linalg.norm(arrays[name].astype(float), axis=1).max()
-        if step > _MAX_STEP_M:
+        if step > extent:
             raise ValueError(
-                f"`{name}` in {source} must be in metres; got steps of up to {step:.3g}. "
-                "Is it in another unit than `v_template`?"
+                f"`{name}` in {source} must be in metres; got steps of up to {step:.3g} for a hand "
+                f"{extent:.3g} long. Is it in another unit than `v_template`?"
             )
     _check_tree(tree, source)
     _check_joints(arrays, extent, source)
@@ -270,33 +268,46 @@ def _check_joints(arrays: Mapping[str, np.ndarray], extent_m: float, source: str
     """The joints must come in MANO's order, in `J_regressor` and in `weights` alike."""
     v_template, weights = (arrays[name].astype(float) for name in ("v_template", "weights"))
     joints = arrays["J_regressor"].astype(float) @ v_template
-    child = np.array([joint for joint, parent in enumerate(MANO_PARENTS) if parent > 0])
-    bones = np.linalg.norm(joints[child] - joints[np.array(MANO_PARENTS)[child]], axis=1) / extent_m
-    index, middle, little, ring = joints[list(_KNUCKLES)]
-    across = np.array([index, middle, ring, little]) @ (little - index)
-    base, _, last = np.linalg.norm(joints[1:] - joints[0], axis=1).reshape(-1, 3).T
-    got = None
-    if bones.max() > _MAX_BONE:
-        joint = child[bones.argmax()]
-        got = f"{bones.max():.0%} of the hand's length from joint {joint} to the one before it in its finger"
-    elif (base > last).any():
-        got = "the base of a finger farther from the wrist than its last joint"
-    elif base[_THUMB] > base.min():
-        got = "a knuckle nearer to the wrist than the base of the thumb"
-    elif (np.diff(across) < 0).any():
-        got = "knuckles in another order across the palm"
-    if got is not None:
+    if (got := _another_order(joints, extent_m)) is not None:
         raise ValueError(
             f"`J_regressor` in {source} must give the joints in MANO's order (wrist; index, middle, little, "
             f"ring finger, thumb, each from its base); got {got}"
         )
-    moved = weights.T @ v_template / np.maximum(weights.sum(0), 1e-9)[:, None]
-    away = np.linalg.norm(moved - joints, axis=1)[1:] / extent_m
-    if away.max() > _MAX_AWAY:
+    moves = weights.sum(0)
+    if (moves <= 0).any():
+        raise ValueError(
+            f"`weights` in {source} must move vertices with each joint; none follows joint "
+            f"{(moves <= 0).argmax()}"
+        )
+    # What joints move lies about them in the order in which they lie, whatever the hand's size and turn.
+    moved = weights.T @ v_template / moves[:, None]
+    alike = np.einsum("abx,abx->ab", *(points[1:, None] - points[1:] for points in (joints, moved)))
+    if (alike + np.eye(len(alike)) <= 0).any():
+        first, second = 1 + np.argwhere(alike + np.eye(len(alike)) <= 0)[0]
         raise ValueError(
             f"the columns of `weights` in {source} must come in the order of the rows of `J_regressor`; got "
-            f"weights of joint {away.argmax() + 1} about a place {away.max():.0%} of the hand's length away"
+            f"weights of joints {first} and {second} that lie the other way round"
         )
+
+
+def _another_order(joints: np.ndarray, extent_m: float) -> str | None:
+    """Say what shows that the joints (16, 3) of a resting hand are in another order; None = nothing does."""
+    child = np.array([joint for joint, parent in enumerate(MANO_PARENTS) if parent > 0])
+    bones = np.linalg.norm(joints[child] - joints[np.array(MANO_PARENTS)[child]], axis=1) / extent_m
+    if bones.max() > _MAX_BONE:
+        joint = child[bones.argmax()]
+        return f"{bones.max():.0%} of the hand's length from joint {joint} to the one before it in its finger"
+    from_wrist = np.linalg.norm(joints[1:] - joints[0], axis=1).reshape(-1, 3)
+    if (np.diff(from_wrist, axis=1) <= 0).any():
+        return "a joint of a finger nearer to the wrist than the one before it"
+    if from_wrist[:, 0].argmin() != _THUMB:
+        return "a knuckle nearer to the wrist than the base of the thumb"
+    index, middle, little, ring = joints[list(_KNUCKLES)]
+    across = np.array([index, middle, ring, little]) @ (little - index)
+    thumb = joints[1 + 3 * _THUMB]
+    if (np.diff(across) <= 0).any() or np.linalg.norm(thumb - index) >= np.linalg.norm(thumb - little):
+        return "knuckles in another order across the palm"
+    return None
 
 
 def _check_tree(tree: Any, source: str) -> None:

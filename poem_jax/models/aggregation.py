@@ -20,7 +20,8 @@ _POINTS_AT_A_TIME = 512
 
 
 class ProjectiveAggregation(nnx.Module):
-    """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N; by default exactly f1 where one view is valid."""
+    """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N, exactly f1 where one view is valid; or, for
+    `Similarity.EQUAL`, all views alike."""
 
     def __init__(self, config: AggregationConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.is_release = config.design is Design.RELEASE

@@ -376,9 +376,12 @@ class Config:
         )
         require(
             not self.features.heat_maps
-            or (self.features.design is Design.PAPER and self.features.stride == self.root.stride),
-            "`features.heat_maps` needs `features.design` = paper and maps of one stride; got "
-            f"`features.stride` = {self.features.stride}, `root.stride` = {self.root.stride}",
+            or (
+                self.features.design is self.root.design is Design.PAPER
+                and self.features.stride == self.root.stride
+            ),
+            "`features.heat_maps` needs `features` and `root` of `design` = paper and of one `stride`; got "
+            f"{self.features.design} of {self.features.stride} and {self.root.design} of {self.root.stride}",
         )
         require(
             self.width % (4 * self.decoder.num_heads) == 0,

@@ -17,7 +17,7 @@ from poem_jax.typing import Array, Bool, Float
 
 _TEMPERATURE = 10000.0
 _MIN_HEAT, _EVIDENCE_SCALE = 0.01, 0.25
-"""Of an even map's heat, and what brings the logarithms to between -1.2 and 1.7."""
+"""Of an even map's heat, and what brings the logarithms to between -1.2 and, for 32 x 32 cells, 1.7."""
 _EPSILON = 1e-6
 """Added by the release to the number of views, rows and columns that its positions are divided by."""
 
@@ -51,7 +51,7 @@ class FeatureBranch(nnx.Module):
 
 
 def evidence(heat_maps: Float[Array, "image joint h w"]) -> Float[Array, "image h w joint"]:
-    """Return the logarithm of each map over an even one: where it says nothing zero, as beyond the border."""
+    """Return the logarithm of each map over an even one: zero where it says nothing."""
     cells = heat_maps.shape[-2] * heat_maps.shape[-1]
     return jnp.moveaxis(jnp.log(cells * heat_maps + _MIN_HEAT) * _EVIDENCE_SCALE, -3, -1)
 

@@ -130,22 +130,25 @@ def test_a_search_that_is_stopped_too_early_writes_nothing(capture, rig, seen, c
     assert "nothing is written of the frames that were searched" in caplog.text
 
 
-@pytest.mark.parametrize("earlier", [False, True])
-def test_part_of_a_search_replaces_no_whole_one(make_capture, monkeypatch, capsys, hand_boxes, earlier):
+def test_part_of_a_search_has_a_name_of_its_own(make_capture, monkeypatch, capsys, hand_boxes):
     def stopped(*_, when_stopped, **__):
         when_stopped(hand_boxes)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("poem_jax.capture.detect.detect_hands", stopped)
     folder = make_capture().folder
     out, part = folder / "found.npz", folder / "found.part.npz"
-    if earlier:
-        out.write_bytes(b"whole")
-    assert main(["detect", str(folder), "--out", str(out)]) == 130
-    written = part if earlier else out
-    assert read_boxes(written).frames == hand_boxes.frames
-    assert f"what was done so far is in {written}" in capsys.readouterr().err
-    assert not earlier or out.read_bytes() == b"whole"
+    command = ["detect", str(folder), "--out", str(out)]
+    out.write_bytes(b"whole")
+    with monkeypatch.context() as patched:
+        patched.setattr("poem_jax.capture.detect.detect_hands", stopped)
+        assert main(command) == 130
+    assert f"what was done so far is in {part}" in capsys.readouterr().err
+    assert read_boxes(part).frames == hand_boxes.frames
+    assert out.read_bytes() == b"whole"
+    monkeypatch.setattr("poem_jax.capture.detect.detect_hands", lambda *_, **__: hand_boxes)
+    assert main(command) == 0
+    assert read_boxes(out).frames == hand_boxes.frames
+    assert not part.exists()
 
 
 def test_no_hand_at_all_is_an_error(capture, rig):

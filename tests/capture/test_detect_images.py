@@ -170,10 +170,12 @@ def test_hands_are_followed_through_a_video(shared_dir):
     views, followed_views = (
         np.isfinite(hands.keypoints_px).all((-1, -2)).sum(2) >= 2 for hands in (each, followed)
     )
-    assert np.all(followed_views[views].mean() >= 0.95)
+    assert np.all((views & followed_views).sum(0) >= 0.95 * views.sum(0))
     same, other = (
         np.linalg.norm(each.keypoints_px - keypoints, axis=-1).mean(-1)
         for keypoints in (followed.keypoints_px, followed.keypoints_px[:, ::-1])
     )
-    assert not np.any(other < same)
+    both = np.isfinite(same) & np.isfinite(other)
+    assert both.sum() > 100
+    assert np.all(same[both] < other[both])
     assert np.nanmedian(same) < 5

@@ -25,6 +25,7 @@ from scipy import sparse
 from poem_jax.calibration.rig_json import read_rig
 from poem_jax.capture.boxes_file import read_boxes
 from poem_jax.hand import mano_file
+from poem_jax.hand.template import default_hand
 from poem_jax.io.checksums import check_checksums
 from poem_jax.io.images import read_image
 from poem_jax.io.json_file import read_json
@@ -89,13 +90,15 @@ def npz(**arrays: np.ndarray) -> bytes:
 
 
 def hand() -> dict[str, Any]:
-    """Fields of MANO, small where they can be: what is not structure is all zeros, but for its length."""
+    """Fields of MANO, small where they can be: a hand of its 16 joints, each of which moves a vertex."""
+    v_template = np.zeros((778, 3), np.float16)
+    v_template[:16] = np.asarray(default_hand().J_regressor @ default_hand().v_template)
     return {
-        "v_template": np.eye(778, 3, -775, dtype=np.float16) / 8,
+        "v_template": v_template,
         "shapedirs": np.zeros((778, 3, 10), np.float16),
         "posedirs": np.zeros((778, 3, 135), np.float16),
         "J_regressor": np.eye(16, 778),
-        "weights": np.eye(1, 16).repeat(778, 0),
+        "weights": np.concatenate([np.eye(16), np.eye(1, 16).repeat(762, 0)]),
         "f": np.tile(np.arange(3, dtype=np.uint16), (1538, 1)),
         "hands_mean": np.zeros(45),
         "hands_components": np.zeros((45, 45), np.float16),

@@ -34,12 +34,21 @@ def _fields() -> dict:
     }
 
 
-_OTHER_ORDER = [0, 13, 14, 15, 1, 2, 3, 4, 5, 6, 10, 11, 12, 7, 8, 9]
-"""Wrist, then thumb to little finger."""
+_OTHER_ORDERS = [
+    (list(range(15, -1, -1)), ".* of the hand's length from joint"),
+    ([0, 3, 2, 1, *range(4, 16)], "a joint of a finger nearer to the wrist than the one before it"),
+    ([0, 1, 3, 2, *range(4, 16)], "a joint of a finger nearer to the wrist than the one before it"),
+    ([0, 13, 14, 15, 1, 2, 3, 4, 5, 6, 10, 11, 12, 7, 8, 9], "a knuckle nearer to the wrist than the base"),
+    ([*range(7), 10, 11, 12, 7, 8, 9, 13, 14, 15], "knuckles in another order across the palm"),
+    ([0, 7, 8, 9, 10, 11, 12, *range(1, 7), 13, 14, 15], "knuckles in another order across the palm"),
+]
+"""And what tells: backwards, a finger backwards, two of its joints exchanged, thumb first, ring before
+little finger, from the little finger to the index."""
 
 
-def _dense(name: str) -> np.ndarray:
-    return np.asarray(getattr(default_hand(), name), np.float64)
+def _in_order(order: list[int], name: str) -> dict:
+    array = np.asarray(getattr(default_hand(), name), np.float64)
+    return {name: array[order] if name == "J_regressor" else array[:, order]}
 
 
 def _same(got: HandModel, side: str = "right") -> None:
@@ -205,16 +214,18 @@ def test_reads_the_reference_asset(shared_dir: Path):
         ({"f": np.array([[0, 1, 2]] * 1537 + [[3, 4, 3]])}, r"`f` .*; 1 faces .* the first is \[3, 4, 3\]"),
         ({"shapedirs": 1000 * _fields()["shapedirs"]}, r"`shapedirs` .* must be in metres.*another unit"),
         ({"posedirs": 1000 * _fields()["posedirs"]}, r"`posedirs` .* must be in metres.*another unit"),
+        ({"shapedirs": 100 * _fields()["shapedirs"]}, r"`shapedirs` .* must be in metres.*another unit"),
         *(
-            ({"J_regressor": _dense("J_regressor")[order]}, f"`J_regressor` .* MANO's order .*{got}")
-            for order, got in [
-                ([0, 3, 2, 1, *range(4, 16)], "the base of a finger farther from the wrist"),
-                (list(range(15, -1, -1)), "of the hand's length from joint"),
-                (_OTHER_ORDER, "a knuckle nearer to the wrist"),
-                ([*range(7), 10, 11, 12, 7, 8, 9, 13, 14, 15], "knuckles in another order across the palm"),
-            ]
+            ({**_in_order(order, "J_regressor"), **change}, f"`J_regressor` .* MANO's order .*; got {got}")
+            for order, got in _OTHER_ORDERS
+            for change in ({}, _in_order(order, "weights"))
         ),
-        ({"weights": _dense("weights")[:, _OTHER_ORDER]}, "columns of `weights` .* order of the rows"),
+        *(
+            (_in_order(order, "weights"), "columns of `weights` .* order of the rows .* the other way round")
+            for order, _ in [*_OTHER_ORDERS, ([0, 1, 3, 2, *range(4, 16)], "")]
+        ),
+        ({"weights": np.eye(1, 16).repeat(778, 0)}, "`weights` .* none follows joint 1"),
+        ({"J_regressor": np.full((16, 778), 1 / 778)}, "`J_regressor` .* MANO's order"),
         ({"weights": None}, "missing: weights"),
     ],
 )

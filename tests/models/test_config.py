@@ -56,24 +56,20 @@ def test_unknown_choice_fails():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("features", "root", "got"),
     [
+        (FeatureConfig(stride=8), RootConfig(stride=4), "paper of 8 and paper of 4"),
         (
-            {"features": FeatureConfig(stride=8, heat_maps=True), "root": RootConfig(stride=4)},
-            "maps of one stride",
+            FeatureConfig(stride=16, design=Design.RELEASE),
+            RootConfig(stride=16),
+            "release of 16 and paper of 16",
         ),
-        (
-            {
-                "features": FeatureConfig(stride=16, design=Design.RELEASE, heat_maps=True),
-                "root": RootConfig(stride=16),
-            },
-            r"`features\.heat_maps` needs `features\.design` = paper",
-        ),
+        (FeatureConfig(), RootConfig(design=Design.RELEASE), "paper of 8 and release of 8"),
     ],
 )
-def test_heat_maps_join_only_features_like_them(change, message):
-    with pytest.raises(ValueError, match=message):
-        Config(**change)
+def test_heat_maps_join_only_features_like_them(features, root, got):
+    with pytest.raises(ValueError, match=f"`features.heat_maps` needs .* got {got}"):
+        Config(features=replace(features, heat_maps=True), root=root)
 
 
 def test_equal_views_are_the_papers():

@@ -9,8 +9,17 @@ import pytest
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models import infer as inference
 from poem_jax.models.apply import apply
-from poem_jax.models.config import AggregationConfig, DecoderOutput, Design, FeatureConfig, RootConfig
+from poem_jax.models.config import (
+    AggregationConfig,
+    DecoderOutput,
+    Design,
+    FeatureConfig,
+    RootConfig,
+    Similarity,
+)
 from poem_jax.models.infer import infer, prepare
+from poem_jax.models.layers import NormMode
+from poem_jax.models.network import assemble
 
 METRES = 2e-5
 METRES_IN_FLOAT64 = 1e-9
@@ -29,14 +38,25 @@ def like_release(micro, output=DecoderOutput.OFFSETS):
     )
 
 
-@pytest.fixture(params=["micro_config", "parametric_config", "release", "release_parametric"])
+def with_heat_maps(micro):
+    """Heat maps among the features of views that are all alike."""
+    return replace(
+        micro,
+        root=RootConfig(num_joints=21, stride=4),
+        features=FeatureConfig(stride=4, heat_maps=True),
+        aggregation=AggregationConfig(similarity=Similarity.EQUAL),
+    )
+
+
+@pytest.fixture(params=["micro_config", "parametric_config", "release", "release_parametric", "heat_maps"])
 def model(request, make_params, micro_config):
     if request.param.startswith("release"):
         parametric = request.param.endswith("parametric")
         output = DecoderOutput.HAND_PARAMETERS if parametric else DecoderOutput.OFFSETS
         config = like_release(micro_config, output)
     else:
-        config = request.getfixturevalue(request.param)
+        heat_maps = request.param == "heat_maps"
+        config = with_heat_maps(micro_config) if heat_maps else request.getfixturevalue(request.param)
         config = replace(config, decoder=replace(config.decoder, num_neighbours=64))
     return config, make_params(config)
 
@@ -66,6 +86,30 @@ def test_infer_finds_what_apply_finds(model, make_scene):
     np.testing.assert_allclose(found.keypoints_px[MASK], expected.keypoints_px[MASK], atol=1e-3)
     assert not np.any(found.keypoints_px[~MASK])
     assert not np.any(found.heat_maps[~MASK])
+
+
+def test_bytes_are_seen_as_apply_sees_them(micro_config, make_params, make_scene):
+    views, cams = make_scene(3, 4)
+    params = make_params(micro_config)
+    found, expected = (
+        run.keypoints_px
+        for run in (
+            infer(prepare(params, micro_config), views, cams),
+            apply(params, views, cams, config=micro_config),
+        )
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_a_moved_heat_map_moves_the_features_at_its_place(micro_config, make_params):
+    config = with_heat_maps(micro_config)
+    model = assemble(config, make_params(config))
+    levels = model.trunk(np.zeros((1, *config.image_hw, 3), np.float32), NormMode())
+    _, heat = model.heat_maps(levels, NormMode())
+    moved = heat.at[0, 5, 1, 2].multiply(3.0)
+    before, after = (model.features(levels, maps, NormMode()) for maps in (heat, moved))
+    changed = np.argwhere(np.abs(before - after).max(-1) > 1e-6)
+    np.testing.assert_array_equal(changed, [[0, 1, 2]])
 
 
 def test_only_views_and_samples_that_exist_cost_anything(micro_config, make_params, make_scene, monkeypatch):
@@ -118,7 +162,7 @@ def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkey
     infer(prepared, views, cams._replace(view_mask=MASK))
     halves = (inference._look, inference._find)
     jitted = [inference._cpu_program(half, alone) for half in halves for alone in (True, False)]
-    jitted += [inference._write, inference._read]
+    jitted += [inference._look, inference._find, inference._write, inference._read]
     before = [program._cache_size() for program in jitted]
     for mask in (~MASK | np.array([True, True, False, False]), np.ones((3, 4), bool)):
         infer(prepared, views, cams._replace(view_mask=mask))

@@ -61,7 +61,7 @@ def test_the_release_reads_through_the_camera(ramp):
     np.testing.assert_allclose(front, back, atol=1e-4)
 
 
-def test_evidence_is_nothing_where_a_map_is_even_or_ends():
+def test_evidence_is_nothing_where_a_map_is_even():
     heat = np.full((1, 3, 4, 4), 1 / 16, np.float32)
     heat[0, 1], heat[0, 1, 2, 3] = 0, 1
     heat[0, 2, 0, 0] = 2 / 16
