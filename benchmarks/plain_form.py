@@ -115,7 +115,8 @@ def plain_views(
     """Return what is computed of every view alone: key points in pixels, heat maps, feature maps."""
     dtype = params["constants"]["basis_points"].dtype
     levels = plain_trunk(params, normalised(images, config, dtype), config)
-    of_images = (*plain_heat_maps(params, levels, config), plain_features(params, levels, config))
+    keypoints_px, heat_maps = plain_heat_maps(params, levels, config)
+    of_images = (keypoints_px, heat_maps, plain_features(params, levels, heat_maps, config))
     keypoints_px, heat_maps, maps = (_by_view(x, images) for x in of_images)
     return keypoints_px, heat_maps, maps
 
@@ -239,7 +240,9 @@ def plain_heat_maps(
     return keypoints_px, heat / total[..., None, None]
 
 
-def plain_features(params: Params, levels: list[Array], config: Config) -> Float[Array, "image h w c"]:
+def plain_features(
+    params: Params, levels: list[Array], heat_maps: Array, config: Config
+) -> Float[Array, "image h w c"]:
     """Return the maps that the basis points sample, without the position code."""
     w = _weights(params)["features"]
     if config.features.design is Design.PAPER:
@@ -249,6 +252,10 @@ def plain_features(params: Params, levels: list[Array], config: Config) -> Float
         for reduce, coarser in zip(_rows(w["branch"]["reductions"]), levels[1:], strict=True):
             x = _conv_norm(x, reduce, stride=2) + coarser
         x = _conv(_doubled(x), w["branch"]["squeeze"])
+    if config.features.heat_maps:
+        cells = heat_maps.shape[-2] * heat_maps.shape[-1]
+        evidence = jnp.log(cells * heat_maps + 0.01) / 4
+        x = jnp.concatenate([x, evidence.transpose(0, 2, 3, 1)], -1)
     return _conv(x, w["project"])
 
 
@@ -321,6 +328,8 @@ def plain_aggregation(
     else:
         tokens = sampled.transpose(0, 2, 1, 3)
     theta = _two_layers(tokens, w["theta_in"], w["theta_out"])
+    if config.aggregation.similarity is Similarity.EQUAL:
+        return tokens.mean(2) + _two_layers(theta.mean(2), w["phi_in"], w["phi_out"])
     first, sources = theta[:, :, 0], theta[:, :, 1:]
     similarity = jnp.einsum("bnc,bnvc->bnv", first, sources)
     if config.aggregation.similarity is Similarity.MEAN:

@@ -78,11 +78,12 @@ def test_the_example_of_the_readme(run):
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     error, unit = run("python", "-c", code).split()
     assert unit == "mm"
-    assert 0 < float(error) < 30
+    (promised,) = re.findall(r"# (\d+\.\d);", code)
+    assert float(error) == pytest.approx(float(promised), abs=0.1)
 
 
 def test_demo(run, tmp_path):
-    assert "MPVPE 11.3 mm" in run("poem", "demo")
+    assert "MPVPE 5.4 mm" in run("poem", "demo")
     assert (tmp_path / "out" / "demo" / "index.html").is_file()
 
 

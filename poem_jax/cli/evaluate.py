@@ -12,7 +12,9 @@ from poem_jax.cli.options import Experiment, Flag, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.hand.model import HandModel
+    from poem_jax.models.config import Config
     from poem_jax.synthetic.config import SyntheticConfig
+    from poem_jax.synthetic.dataset import SyntheticDataset
     from poem_jax.training.config import TrainConfig
     from poem_jax.typing import Params
 
@@ -43,6 +45,9 @@ class Eval:
     """Captures at a time."""
     json: OptionalFile = None
     """Write all metrics there, by view count."""
+    stages: Flag = False
+    """Print, too, which stage does the work: errors after each layer, and with features, root or joints
+    replaced (for 2 views or more, on whole batches of captures; not in the JSON file)."""
     no_progress: Flag = False
     """Show no progress bar."""
     debug: Flag = False
@@ -60,6 +65,13 @@ class Eval:
 
         if self.json is not None:
             check_file_is_writable(self.json, "--json")
+        if self.stages and (
+            max(view_counts(self.views)) < 2 or self.batch_size < 2 or self.samples < self.batch_size
+        ):
+            raise ValueError(
+                "--stages needs a view count of 2 or more, and --samples of at least one batch of 2 or more; "
+                f"got --views {self.views}, --samples {self.samples}, --batch-size {self.batch_size}"
+            )
         settings = BenchmarkSettings(
             views=view_counts(self.views),
             samples=self.samples,
@@ -83,6 +95,26 @@ class Eval:
         print(f"{config.name}: weights {weights}, protocol {self.protocol}")
         print(f"{self.samples} synthetic captures of seed {self.seed}{seen}; {seconds:.0f} s\n")
         print(format_report(results, regressed_joints=PROTOCOLS[self.protocol].regresses_joints))
+        if self.stages:
+            self._print_stages(params, config.model, captures)
+
+    def _print_stages(self, params: "Params", model: "Config", captures: "SyntheticDataset") -> None:
+        from poem_jax.evaluation.stages import format_stages, stage_errors
+
+        samples, size = self.samples - self.samples % self.batch_size, self.batch_size
+        say(f"{samples} captures again, each part of the model replaced in turn")
+        print()
+        print(
+            format_stages(
+                {
+                    views: stage_errors(
+                        params, model, captures, samples=samples, num_views=views, batch_size=size
+                    )
+                    for views in view_counts(self.views)
+                    if views > 1
+                }
+            )
+        )
 
 
 def view_counts(text: str) -> tuple[int, ...]:

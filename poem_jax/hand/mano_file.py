@@ -51,6 +51,8 @@ _THUMB = 4
 _SUM_TOLERANCE = 1e-3
 _EXTENT_M = (0.05, 1.0)
 """Of any hand in metres."""
+_MIN_STEP = 1e-4
+"""Of shape and pose directions, as a share of the hand's extent; ours reach 0.05."""
 _MAX_BONE = 0.35
 """A finger's longest bone as a share of the hand's extent; our own hand has 0.24."""
 _CLEAR_AGREEMENT = 0.3
@@ -253,9 +255,10 @@ def _check_values(arrays: Mapping[str, np.ndarray], tree: Any, source: str) -> N
                 f"got sums from {sums.min():.4g} to {sums.max():.4g}"
             )
     for name in ("shapedirs", "posedirs"):
-        # Moved by more than a hand's length by one coefficient, or by one entry of R - 1.
+        # Moved by more than a hand's length by one coefficient, or by one entry of R - 1; or by nothing that
+        # could be seen, unless there is none at all.
         step = np.linalg.norm(arrays[name].astype(float), axis=1).max()
-        if step > extent:
+        if step > extent or 0 < step < _MIN_STEP * extent:
             raise ValueError(
                 f"`{name}` in {source} must be in metres; got steps of up to {step:.3g} for a hand "
                 f"{extent:.3g} long. Is it in another unit than `v_template`?"

@@ -1,8 +1,9 @@
 """The named models.
 
 `v2-small`, `v2-base`, `v2-large`, `v2-param` are the paper's; `v2-small-release`, `v2-medium-release`,
-`v2-large-release`, `v2-medium-mano-release` those that the authors released, for their weights; `tiny` is
-ours, for a CPU.
+`v2-large-release`, `v2-medium-mano-release` those that the authors released, for their weights; `v2-nano` is
+the paper's structure (the template first, sigmoid maps of the release's 21 joints, nearest points anew in
+every layer, the primary view's similarities) on a small trunk; `tiny`, on the same trunk, is ours, for a CPU.
 """
 
 from dataclasses import replace
@@ -19,7 +20,6 @@ from poem_jax.models.config import (
     FeatureConfig,
     FirstQueries,
     HeatActivation,
-    NeighbourSearch,
     ResNetConfig,
     RootConfig,
     Similarity,
@@ -58,20 +58,30 @@ TINY = Config(
     ),
     root=RootConfig(
         num_joints=NUM_JOINTS,
+        stride=4,
         activation=HeatActivation.SOFTMAX,
         view_weights=ViewWeights.HEAT_SPREAD,
     ),
+    features=FeatureConfig(stride=4, heat_maps=True),
     basis=BasisConfig(num_points=1024),
-    aggregation=AggregationConfig(similarity=Similarity.MEAN),
+    aggregation=AggregationConfig(similarity=Similarity.EQUAL),
     decoder=DecoderConfig(
         num_layers=2,
         num_neighbours=8,
         ffn_expansion=2,
         first_queries=FirstQueries.JOINTS,
-        neighbour_search=NeighbourSearch.ONCE,
         cross_attention_basis_stride=4,
         embed_coordinates=True,
     ),
+)
+
+V2_NANO = Config(
+    image_hw=TINY.image_hw,
+    crop=TINY.crop,
+    width=64,
+    backbone=TINY.backbone,
+    root=RootConfig(num_joints=NUM_JOINTS),
+    basis=BasisConfig(num_points=2048),
 )
 
 PRESETS = {
@@ -83,6 +93,7 @@ PRESETS = {
     "v2-medium-release": V2_MEDIUM_RELEASE,
     "v2-large-release": V2_LARGE_RELEASE,
     "v2-medium-mano-release": V2_MEDIUM_MANO_RELEASE,
+    "v2-nano": V2_NANO,
     "tiny": TINY,
 }
 

@@ -83,6 +83,9 @@ def test_prints_the_tables_and_writes_json_by_view_count(experiment, tmp_path, c
         (["--samples", "0"], "`samples` and `batch_size` must be at least 1"),
         (["--seed", "-1"], "`seed` must not be negative"),
         (["--checkpoint", "nowhere"], "no checkpoint at nowhere"),
+        (["--stages", "--views", "1"], "--stages needs a view count of 2 or more"),
+        (["--stages", "--samples", "4"], "got --views 1,2,4,8, --samples 4, --batch-size 8"),
+        (["--stages", "--batch-size", "1"], "at least one batch of 2 or more"),
     ],
 )
 def test_bad_arguments_end_with_a_message(experiment, capsys, arguments, message) -> None:

@@ -5,15 +5,15 @@ import pytest
 
 from poem_jax.cli.evaluate import captures_config
 from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
-from poem_jax.evaluation.stages import FeatureErrors, errors_by_features, paired_difference
+from poem_jax.evaluation.stages import StageErrors, paired_difference, stage_errors
 from poem_jax.experiments import open_experiment
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.weights.store import shipped
 
 SEED, SAMPLES, VIEWS = 987654, 64, 4
 """Of the captures, on which no model was trained or chosen."""
-MAX_MPVPE_MM = 15.9
-"""On these captures; 15.64 when it was set. Better weights lower it."""
+MAX_MPVPE_MM = 10.1
+"""On these captures; 9.89 when it was set. Better weights lower it."""
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,9 @@ def captures() -> SyntheticDataset:
 
 
 @pytest.fixture(scope="module")
-def errors(captures) -> FeatureErrors:
+def errors(captures) -> StageErrors:
     config, params = shipped()
-    return errors_by_features(params, config, captures, samples=SAMPLES, num_views=VIEWS)
+    return stage_errors(params, config, captures, samples=SAMPLES, num_views=VIEWS)
 
 
 def test_it_is_there_and_of_its_experiment() -> None:
@@ -38,17 +38,25 @@ def test_it_has_not_got_worse(errors) -> None:
     assert errors.own.mean() <= MAX_MPVPE_MM
 
 
-@pytest.mark.parametrize(("features", "margin_mm"), [("zero", 0.5), ("another", 0.1)])
+@pytest.mark.parametrize(("features", "margin_mm"), [("zero", 0.5), ("another", 0.25)])
 def test_its_second_stage_reads_the_images(errors, features: str, margin_mm: float) -> None:
     """On the same captures it is worse without its features, and with those of another capture.
 
-    By 1.00 and 0.29 mm when this was written, 9 and 4.5 standard errors. A second stage that ignores its
-    features differs by nothing, one that ignores whose they are differs in the first case alone.
+    By 22 and 0.5 mm when this was written; zeros never occur in training, so the second says more. A second
+    stage that ignores its features differs by nothing, one that ignores whose they are in the first case
+    alone.
     """
     worse = paired_difference(getattr(errors, features), errors.own)
     print(worse)
     assert worse.mean_mm >= margin_mm
     assert worse.mean_mm >= 3 * worse.standard_error_mm
+
+
+def test_its_second_stage_gains_on_the_first(errors) -> None:
+    """Little, so far: 0.13 mm on the template posed by the triangulated joints when this was written."""
+    gain = paired_difference(errors.posed, errors.own)
+    print(gain)
+    assert gain.mean_mm >= 2 * gain.standard_error_mm > 0
 
 
 @pytest.mark.slow
@@ -60,5 +68,5 @@ def test_more_views_are_better(captures) -> None:
     means = [scores[n]["mpvpe_mm"] for n in (2, 4, 8)]
     print(means)
     assert np.all(np.diff(means) < 0)
-    assert means[1] <= MAX_MPVPE_MM
-    assert means[1] <= scores[4]["mean_pose_mpvpe_mm"] / 3
+    assert means[1] <= MAX_MPVPE_MM + 0.2
+    assert means[1] <= scores[4]["mean_pose_mpvpe_mm"] / 5

@@ -215,6 +215,7 @@ def test_reads_the_reference_asset(shared_dir: Path):
         ({"shapedirs": 1000 * _fields()["shapedirs"]}, r"`shapedirs` .* must be in metres.*another unit"),
         ({"posedirs": 1000 * _fields()["posedirs"]}, r"`posedirs` .* must be in metres.*another unit"),
         ({"shapedirs": 100 * _fields()["shapedirs"]}, r"`shapedirs` .* must be in metres.*another unit"),
+        ({"shapedirs": _fields()["shapedirs"] / 1000}, r"`shapedirs` .* must be in metres.*another unit"),
         *(
             ({**_in_order(order, "J_regressor"), **change}, f"`J_regressor` .* MANO's order .*; got {got}")
             for order, got in _OTHER_ORDERS

@@ -86,7 +86,9 @@ def _like_release(micro, output=DecoderOutput.OFFSETS):
 def _like_tiny(micro):
     """All choices of `tiny` at the size of `micro`."""
     decoder = replace(TINY.decoder, num_neighbours=4, ffn_expansion=1)
-    return replace(micro, root=TINY.root, aggregation=TINY.aggregation, decoder=decoder)
+    return replace(
+        micro, root=TINY.root, features=TINY.features, aggregation=TINY.aggregation, decoder=decoder
+    )
 
 
 class Oracle(NamedTuple):
