@@ -327,6 +327,7 @@ def test_the_results_do_not_replace_what_they_come_from(files, tmp_path, capsys,
     assert "would be replaced by a result" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_smoothing_from_the_command_line(files, fitted, tmp_path):
     """On record; frames that have nothing to do with each other stay where they are."""
     keypoints, rig, _ = files

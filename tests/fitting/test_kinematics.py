@@ -15,6 +15,7 @@ from poem_jax.hand.model import HandModel, hand_mesh
 from poem_jax.hand.template import default_hand
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.slow)])
 def test_key_points_and_derivatives_are_those_of_the_mesh(side, float64):
     hand = HandModel(*(a.astype(float) if a.dtype.kind == "f" else a for a in default_hand(side)))

@@ -258,6 +258,7 @@ def smoothed(model, take, mask=None):
     return fit(model, weighted(take, mask), config=FitConfig(smooth=AT_REST))
 
 
+@pytest.mark.slow
 def test_the_second_pass(model, takes):
     """Nearer to the truth, surer of it with reason; and a gap is bridged, but not called valid."""
     take = walking(takes(FRAMES, 4, 0.0, 13), model.hand, 1.0)

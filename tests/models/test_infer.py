@@ -48,7 +48,10 @@ def with_heat_maps(micro):
     )
 
 
-@pytest.fixture(params=["micro_config", "parametric_config", "release", "release_parametric", "heat_maps"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("release", "release_parametric")]
+
+
+@pytest.fixture(params=["micro_config", "parametric_config", "heat_maps", *SLOW])
 def model(request, make_params, micro_config):
     if request.param.startswith("release"):
         parametric = request.param.endswith("parametric")

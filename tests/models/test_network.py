@@ -267,6 +267,7 @@ def test_gradients_of_cameras_and_root_match_finite_differences(loss64):
             np.testing.assert_allclose((plus - minus) / 2, jnp.sum(gradients[n] * step), rtol=5e-4)
 
 
+@pytest.mark.slow
 def test_gradients_through_apply_match_finite_differences(micro_config, make_params, make_scene):
     """The whole `Cameras` with `allow_int`, or its two arrays."""
     views, cams = make_scene(1, 3)
@@ -298,6 +299,7 @@ def test_gradients_through_apply_match_finite_differences(micro_config, make_par
             np.testing.assert_allclose(alone, getattr(gradient, name), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_params_have_gradients(parametric_config, make_scene):
     """Indices and flags are among the parameters of `init`, and not among what is differentiated."""
     params, scene = init(parametric_config, key=jax.random.key(0)), make_scene(2, 4)

@@ -82,6 +82,7 @@ def test_a_run_in_sittings_passes_from_stage_to_stage_as_a_whole_one(
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
+@pytest.mark.slow
 def test_export_writes_the_averages_of_the_newest_checkpoint(micro_config, batch_at, tmp_path):
     state = train(micro_config, batch_at=batch_at)
     assert export_run(micro_config, tmp_path / "model", dtype=None) == 4

@@ -137,6 +137,7 @@ def test_any_split_over_devices_gives_the_result_of_one(drawn_params, config, mi
             np.testing.assert_allclose(metrics[name], value, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_padding_changes_neither_weights_nor_statistics(drawn_params, config, batch_at):
     """A batch of 5 samples and 2 views equals one of 8 and 3 whose other entries are masked."""
     small = batch_at(1, batch=5, views=2)
