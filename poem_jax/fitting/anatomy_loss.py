@@ -20,11 +20,11 @@ MIN_ANGLE = 0.01
 TERM_WEIGHTS = (1.0, 0.1, 0.1, 1.0, 0.1, 0.1)
 """The release's weights, in the order of `AnatomyTerms`."""
 
-_THUMB = np.array([12])
-_KNUCKLES = np.array([0, 3, 9, 6])
-_RESTRICTED = np.array([1, 2, 4, 5, 7, 8, 10, 11, 13, 14])
+_THUMB = np.array([12], np.int32)
+_KNUCKLES = np.array([0, 3, 9, 6], np.int32)
+_RESTRICTED = np.array([1, 2, 4, 5, 7, 8, 10, 11, 13, 14], np.int32)
 _UP = np.where(np.arange(NUM_SKELETON_JOINTS - 1)[:, None] < 12, [[0.0, 1.0, 0.0]], [[1.0, 1.0, 1.0]])
-_JOINTS = np.array(SKELETON_FROM_OPENPOSE)[1:]
+_JOINTS = np.array(SKELETON_FROM_OPENPOSE, np.int32)[1:]
 
 
 class AnatomyTerms(NamedTuple):

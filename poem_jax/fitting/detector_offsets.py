@@ -29,7 +29,7 @@ NO_DETECTOR = "none"
 _UP = np.array([0.0, 1.0, 0.0])
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 """The reflection that `hand.model.mirror` makes."""
-_SKELETON = np.array(SKELETON_FROM_OPENPOSE)
+_SKELETON = np.array(SKELETON_FROM_OPENPOSE, np.int32)
 
 _log = logging.getLogger(__name__)
 

@@ -39,9 +39,9 @@ POSE_SIZE = 3 * NUM_SKELETON_JOINTS
 STATE_SIZE = POSE_SIZE + 3
 """Pose (the wrist's turn as a small world vector, the fingers' axis-angle) and the wrist's place."""
 
-_SKELETON = np.array(SKELETON_FROM_OPENPOSE)
-_TIPS = np.array([OPENPOSE_FROM_MANO.index(NUM_SKELETON_JOINTS + f) for f in range(NUM_FINGERS)])
-_PARENTS = np.array(MANO_PARENTS[1:])
+_SKELETON = np.array(SKELETON_FROM_OPENPOSE, np.int32)
+_TIPS = np.array([OPENPOSE_FROM_MANO.index(NUM_SKELETON_JOINTS + f) for f in range(NUM_FINGERS)], np.int32)
+_PARENTS = np.array(MANO_PARENTS[1:], np.int32)
 _SMALL_ANGLE_SQUARED = 1e-4
 
 

@@ -27,7 +27,7 @@ MIN_JOINTS = 3
 MIN_WIDTH_M = 0.005
 """And how far, root mean square, these must lie from one line: a hand could turn about it."""
 
-_SKELETON = np.array(SKELETON_FROM_OPENPOSE)
+_SKELETON = np.array(SKELETON_FROM_OPENPOSE, np.int32)
 _PALM = np.isin(np.arange(NUM_JOINTS), PALM_JOINTS)
 _WRIST_OR_THUMB_BASE = np.isin(np.arange(NUM_JOINTS), PALM_JOINTS[:2])
 

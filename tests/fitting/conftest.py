@@ -19,14 +19,8 @@ def as_float64(hand: HandModel) -> HandModel:
     return HandModel(*(a.astype(np.float64) if a.dtype.kind == "f" else a for a in hand))
 
 
-@pytest.fixture(scope="module")
-def _nothing_cached():
-    """Programs traced in float32 leave index arrays of their precision in JAX's caches."""
-    jax.clear_caches()
-
-
 @pytest.fixture
-def float64(_nothing_cached):
+def float64():
     with jax.enable_x64(True):
         yield
 
