@@ -72,6 +72,7 @@ def train_step(
             config=config.model,
             root_world=root_world,
             train=True,
+            frozen_views=config.frozen_views,
             key=model_key,
             axis_name=axis_name,
         )
