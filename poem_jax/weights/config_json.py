@@ -149,8 +149,10 @@ def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any,
 
 
 def _decode_union(value: Any, declared: Any, path: str) -> Any:
-    require(isinstance(value, dict), f"`{path}` must be an object; got {_short(value)}")
     options = {option.__name__: option for option in typing.get_args(declared)}
+    if options.pop(type(None).__name__, None) and value is None:
+        return None
+    require(isinstance(value, dict), f"`{path}` must be an object; got {_short(value)}")
     kind = value.get(_KIND)
     if not isinstance(kind, str) or kind not in options:
         raise ValueError(f"`{path}.{_KIND}` must be one of {sorted(options)}; got {_short(kind)}")
