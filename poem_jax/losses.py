@@ -166,8 +166,8 @@ def multi_view_losses(
 
     The terms are those of the releases: `keypoints` (of a model with heat maps), `joints`,
     `regressed_joints`, `vertices`, `reprojection`, for parametric predictions `pose` and `shape`, and where
-    the recipe weighs them `heat_maps`, `triangulation` and `vertex_reprojection`. L1 terms are taken in the primary
-    camera's frame, so that no choice of the world frame changes the loss.
+    the recipe weighs them `heat_maps`, `triangulation` and `vertex_reprojection`. L1 terms are taken in the
+    primary camera's frame, so that no choice of the world frame changes the loss.
 
     Args:
         prediction: the model's output; `keypoints_px` holds the root joint only, or all 21.
@@ -182,8 +182,7 @@ def multi_view_losses(
         The loss, and the terms by name (of the last layer; point terms in `recipe.point_unit_m`).
 
     Raises:
-        ValueError: the recipe weighs what the prediction does not have: key points, heat maps, or triangulated
-            joints.
+        ValueError: the recipe weighs what the prediction does not have: key points or triangulated joints.
     """
     view_mask, sample_mask = valid_masks(prediction, batch)
     diagonal = _diagonal(image_hw)
@@ -252,8 +251,8 @@ def _present(value: Array | None, weight: str, recipe: LossRecipe) -> Array:
     """Return what a weight of the recipe is about, or raise where the model does not give it."""
     if value is None:
         raise ValueError(
-            f"the loss recipe {recipe.name!r} weighs `{weight}` by {getattr(recipe, weight):g}, but the model "
-            f"gives no such thing; set its weight to 0, or take the recipe of the model, one of "
+            f"the loss recipe {recipe.name!r} weighs `{weight}` by {getattr(recipe, weight):g}, which the "
+            f"model does not give; set its weight to 0, or take the recipe of the model, one of "
             f"{', '.join(RECIPES)}"
         )
     return value

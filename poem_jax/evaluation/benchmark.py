@@ -112,8 +112,8 @@ def model_predictor(params: Params, config: ModelConfig) -> Predictor:
         root_true, num_views = batch.joints_world[:, ROOT_JOINT], batch.views.shape[1]
         if num_views == 1 and config.triangulates and not config.takes_root:
             raise ValueError(
-                f"this {type(config).__name__} needs two views or more, for one view does not fix the root, and "
-                "it takes none; leave 1 out of the view counts"
+                f"this {type(config).__name__} needs two views or more, for one view does not fix the root, "
+                "and it takes none; leave 1 out of the view counts"
             )
         reconstruct = given if num_views == 1 and config.takes_root else both
         return reconstruct(params, batch.views, batch.cameras, root_true)
@@ -134,8 +134,8 @@ def run_benchmark(
 
     Returns: per view count the metrics of `evaluate`, and `median_mpvpe_mm`, `mpvpe_true_root_mm` and its
     `median_`, `root_error_mm`, `dlt_2px_root_error_mm`, `mean_pose_mpvpe_mm`, `mean_pose_rotated_mpvpe_mm`,
-    `samples` and `unsolved` (samples that the model itself calls invalid; they count in all errors). Errors of
-    a root that the model does not have, or with a true root that it does not take, are None.
+    `samples` and `unsolved` (samples that the model itself calls invalid; they count in all errors). Errors
+    of a root that the model does not have, or with a true root that it does not take, are None.
 
     Raises:
         ValueError: a prediction that is not finite.

@@ -1,4 +1,4 @@
-"""Which stage of a POEM v2 model does the work: its errors when one part is replaced by the truth, or by nothing.
+"""Which stage of a POEM v2 model does the work: its errors with a part replaced by the truth, or by nothing.
 
 The first stage looks at every view alone (`Poem.look`), the second joins the views (`Poem.find_hands`).
 Between the two, feature maps, key points and root can be replaced, and nothing else. A second stage that

@@ -222,13 +222,11 @@ class TrainConfig:
         )
         require(
             not self.first_stage_steps or self.model.triangulates,
-            f"`first_stage_steps` must be 0 for a model without a first stage, {type(self.model).__name__}; got "
-            f"{self.first_stage_steps}",
+            f"`first_stage_steps` must be 0 for a {type(self.model).__name__} without a first stage; "
+            f"got {self.first_stage_steps}",
         )
         needed = self.model.required_views
-        counts = {
-            n for shape in self.data.batches for n in (shape.num_views, shape.min_views or shape.num_views)
-        }
+        counts = {n for shape in self.data.batches for n in (shape.num_views, shape.min_views) if n}
         counts |= set(run.validation_views) if run.validate_every else set()
         require(
             needed is None or counts == {needed},

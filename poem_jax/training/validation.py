@@ -30,8 +30,8 @@ class Validation:
         )
 
     def __call__(self, state: TrainState) -> dict[str, float]:
-        """Return by view count the mean and median vertex error and, where the model has a root, its error, and
-        where it takes one, the vertex error with the true root given, in millimetres."""
+        """Return by view count the mean and median vertex error, the root's error where the model has one,
+        and where it takes one the vertex error with the true root given; millimetres."""
         metrics: dict[str, float] = {}
         params = evaluation_params(state)
         for num_views, batches in self.batches.items():

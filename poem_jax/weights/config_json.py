@@ -1,7 +1,7 @@
 """The JSON form of a model's configuration, saved beside every checkpoint.
 
-A whole config carries the class name of its system as `kind`; without one it is POEM v2's, as files of earlier
-versions are. Unknown keys, missing kinds and values of another type fail; an absent key takes its default.
+A whole config carries the class name of its system as `kind`; without one it is POEM v2's. Unknown keys,
+missing kinds and values of another type fail; an absent key takes its default.
 """
 
 import dataclasses
