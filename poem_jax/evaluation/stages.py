@@ -244,7 +244,7 @@ def _pose(
     hand, order = model.hand.model(), config.decoder.query_order
     posed = first_queries(
         hand,
-        model.template_queries[...],
+        model.template_queries[...],  # pyright: ignore[reportAttributeAccessIssue]
         joints - root[:, None],
         jnp.all(solved, -1),
         config.basis.radius,

@@ -146,10 +146,16 @@ def _check_taken(config: ModelConfig, *, root_world: Any, ball_index: Any, key: 
                 f"`{name}` must be None for this {system}, which draws no points from the cameras' grids; "
                 "leave it out"
             )
-    if key is not None and not (
-        isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.shape
-    ):
-        raise ValueError(f"`key` must be one key of `jax.random.key`; got {key!r}")
+    if key is not None and not _is_one_key(key):
+        raise ValueError(f"`key` must be one key of `jax.random`; got {key!r}")
+
+
+def _is_one_key(key: Any) -> bool:
+    """Whether this is a key of `jax.random.key`, or one of the older `jax.random.PRNGKey`."""
+    if not isinstance(key, jax.Array):
+        return False
+    typed = jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return key.shape == () if typed else key.dtype == np.uint32 and key.ndim == 1
 
 
 def _check_ball_index(ball_index: Any, batch: int, num_views: int, draw: GridDraw) -> None:

@@ -34,8 +34,8 @@ from poem_jax.weights.trunk_keys import trunk_rows
 VARIANTS = tuple(RELEASED)
 """The released models; of POEM v2 each is the preset of that name with the suffix `-release`."""
 
-KEYS: dict[type[ModelConfig], str] = {Config: "release_keys"}
-"""The table of names of each system, a file beside this one, by config class. It has `used_rows`,
+KEYS: dict[type[ModelConfig], str] = {Config: "poem_jax.weights.release_keys"}
+"""The file with the table of names of each system, by config class. It has `used_rows`,
 `unused_shapes` and `hand_prefixes`, and may have `constant_rows` (what of a MANO asset goes beyond a hand
 model) and `aliases` (further names of arrays; `unused_shapes` names them too)."""
 
@@ -76,7 +76,7 @@ class Names(NamedTuple):
 
 def names_of(config: ModelConfig) -> Names:
     """Return the names of the released model of this config."""
-    keys = importlib.import_module(f"{__package__}.{KEYS[type(config)]}")
+    keys = importlib.import_module(KEYS[type(config)])
     rows, aliases = list(keys.used_rows(config)), {}
     if hasattr(keys, "constant_rows"):
         rows += keys.constant_rows(config)
@@ -132,7 +132,7 @@ def convert(
     leaves, problems = read_rows(names.rows, state, expected_leaves(config))
     problems += _unknown_or_unlike(state, names) + _differing_aliases(state, names)
     if problems:
-        raise ValueError(_report(problems, state, variant))
+        raise ValueError(_report(problems, state, variant, config.view_range[1]))
     if isinstance(config, Config):
         leaves |= _constants(config, state, hand, names, **assets)
     else:
@@ -175,7 +175,7 @@ def export_state_dict(config: ModelConfig, params: Params) -> dict[str, np.ndarr
 def _released_configs(like: ModelConfig) -> Iterator[ModelConfig]:
     """List the released configs that `like` may be."""
     _, most = like.view_range
-    for variant in VARIANTS:
+    for variant in RELEASED:
         for dataset in DATASETS:
             yield released(variant, dataset=dataset, num_views=most or 8)
 
@@ -274,9 +274,11 @@ def _differing_aliases(state: dict[str, np.ndarray], names: Names) -> list[str]:
     ]
 
 
-def _report(problems: list[str], state: dict[str, np.ndarray], variant: str) -> str:
+def _report(problems: list[str], state: dict[str, np.ndarray], variant: str, most_views: int | None) -> str:
     looks_like = _guess(state)
-    hint = "Is the file cut short, of another model, or of another number of views?"
+    hint = "Is the file cut short, or of another model?"
+    if most_views is not None:
+        hint = f"Is the file cut short, of another model, or not of `num_views` = {most_views}?"
     if looks_like not in (None, variant):
         hint = f"The state dict looks like {looks_like}: pass that variant."
     return f"the state dict does not fit {variant}: {_shown(problems)}. {hint}"
@@ -288,7 +290,7 @@ def _guess(state: dict[str, np.ndarray]) -> str | None:
     if table is None or table.ndim != 2:
         return _guess_by_names(state)
     parametric = any(name.endswith("mano_linear.weight") for name in state)
-    for variant in VARIANTS:
+    for variant in RELEASED:
         config = released(variant)
         if isinstance(config, Config) and (config.width, is_parametric(config)) == (
             table.shape[1],
@@ -300,7 +302,7 @@ def _guess(state: dict[str, np.ndarray]) -> str | None:
 
 def _guess_by_names(state: dict[str, np.ndarray]) -> str | None:
     """Return the variant, not of POEM v2, that has exactly these names and shapes, if one has."""
-    for variant in VARIANTS:
+    for variant in RELEASED:
         config = released(variant)
         if isinstance(config, Config):
             continue
@@ -329,9 +331,10 @@ def _constants(
     state: dict[str, np.ndarray],
     hand: HandModel,
     names: Names,
-    basis_points: np.ndarray,
-    anchor_points: np.ndarray,
-    anchor_indices: np.ndarray,
+    *,
+    basis_points: Any,
+    anchor_points: Any,
+    anchor_indices: Any,
 ) -> dict[str, np.ndarray]:
     prefixes = [prefix for prefix, used in names.hands.items() if used]
     # The head's hand gives the template, the last layer's the parametric output.
