@@ -25,7 +25,7 @@ MAX_LAYERS = 256
 """Of layers, blocks or modules in a row; the largest model has 9."""
 
 
-def _require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
+def require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
     """Insist that fields are whole numbers from 1 to `most`, or tuples of at most `MAX_LAYERS` of them."""
     for name in names:
         value = getattr(owner, name)
@@ -68,8 +68,8 @@ class HRNetConfig:
     """Residual blocks in every branch of a module."""
 
     def __post_init__(self) -> None:
-        _require_counts(self, "width", "stem_channels")
-        _require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
+        require_counts(self, "width", "stem_channels")
+        require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
         require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 
     @property
@@ -99,8 +99,8 @@ class ResNetConfig:
             len(self.blocks) == len(self.channels) >= 1,
             f"`blocks` and `channels` must name the same stages; got {self.blocks} and {self.channels}",
         )
-        _require_counts(self, "channels", "stem_channels")
-        _require_counts(self, "blocks", most=MAX_LAYERS)
+        require_counts(self, "channels", "stem_channels")
+        require_counts(self, "blocks", most=MAX_LAYERS)
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -161,7 +161,7 @@ class RootConfig:
             self.num_joints in (1, NUM_JOINTS),
             f"`num_joints` must be 1 (the root) or {NUM_JOINTS} (all joints); got {self.num_joints}",
         )
-        _require_counts(self, "stride")
+        require_counts(self, "stride")
 
     @property
     def pooling(self) -> int:
@@ -221,7 +221,7 @@ class BasisConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_points")
+        require_counts(self, "num_points")
         require(
             0 < self.radius < math.inf, f"`radius` must be positive and finite, metres; got {self.radius}"
         )
@@ -303,8 +303,8 @@ class DecoderConfig:
     output: DecoderOutput = DecoderOutput.OFFSETS
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
-        _require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
+        require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
+        require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
         require(0 <= self.dropout < 1, f"`dropout` must be in [0, 1); got {self.dropout}")
         require(
             self.layer is Design.PAPER or self.num_neighbours <= NUM_QUERIES,
@@ -348,7 +348,7 @@ class Config:
     decoder: DecoderConfig = DecoderConfig()
 
     def __post_init__(self) -> None:
-        _require_counts(self, "image_hw", "width")
+        require_counts(self, "image_hw", "width")
         require(
             isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
             f"`image_hw` must be (height, width); got {self.image_hw}",
