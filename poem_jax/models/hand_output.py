@@ -41,11 +41,13 @@ _MAX_JOINT_DISTANCE = 1.5
 """Basis radii. Triangulated joints farther from the root are drawn in before they pose the template."""
 
 
-def template_queries(hand: HandModel, order: QueryOrder) -> Float[Array, "799 3"]:
-    """Return the flat mean hand about its root joint, metres."""
+def template_queries(
+    hand: HandModel, order: QueryOrder, *, center_joint: int = ROOT_JOINT
+) -> Float[Array, "799 3"]:
+    """Return the flat mean hand about its root joint, or another (OpenPose order), metres."""
     dtype = hand.v_template.dtype
     zero_pose, mean_shape = np.zeros((NUM_SKELETON_JOINTS, 3), dtype), np.zeros(NUM_SHAPES, dtype)
-    return join_queries(*hand_mesh(hand, zero_pose, mean_shape, center_joint=ROOT_JOINT), order)
+    return join_queries(*hand_mesh(hand, zero_pose, mean_shape, center_joint=center_joint), order)
 
 
 def pose_by_joints(
