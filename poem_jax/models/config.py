@@ -26,7 +26,7 @@ MAX_LAYERS = 256
 """Of layers, blocks or modules in a row; the largest model has 9."""
 
 
-def _require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
+def require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
     """Insist that fields are whole numbers from 1 to `most`, or tuples of at most `MAX_LAYERS` of them."""
     for name in names:
         value = getattr(owner, name)
@@ -55,6 +55,14 @@ class Stem(enum.StrEnum):
     """4 x 4 pixels become 48 channels, then one 3 x 3 convolution: far cheaper on a CPU."""
 
 
+class FrozenNorms(enum.StrEnum):
+    """Which of a ResNet's batch norms keep what they were pre-trained to."""
+
+    NONE = "none"
+    STAGE_STARTS = "stage_starts"
+    """That of the stem, and all in the first block of every stage (the v1 release)."""
+
+
 @dataclass(frozen=True)
 class HRNetConfig:
     """HRNet classification trunk (Wang et al. 2020): four parallel branches of strides 4, 8, 16, 32."""
@@ -69,8 +77,8 @@ class HRNetConfig:
     """Residual blocks in every branch of a module."""
 
     def __post_init__(self) -> None:
-        _require_counts(self, "width", "stem_channels")
-        _require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
+        require_counts(self, "width", "stem_channels")
+        require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
         require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 
     @property
@@ -94,14 +102,15 @@ class ResNetConfig:
     bottleneck: bool = True
     stem: Stem = Stem.CONVOLUTION
     stem_channels: int = 64
+    frozen_norms: FrozenNorms = FrozenNorms.NONE
 
     def __post_init__(self) -> None:
         require(
             len(self.blocks) == len(self.channels) >= 1,
             f"`blocks` and `channels` must name the same stages; got {self.blocks} and {self.channels}",
         )
-        _require_counts(self, "channels", "stem_channels")
-        _require_counts(self, "blocks", most=MAX_LAYERS)
+        require_counts(self, "channels", "stem_channels")
+        require_counts(self, "blocks", most=MAX_LAYERS)
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -114,9 +123,9 @@ class ResNetConfig:
         return cls(blocks=(2, 2, 2, 2), channels=(64, 128, 256, 512), bottleneck=False)
 
     @classmethod
-    def resnet34(cls) -> "ResNetConfig":
+    def resnet34(cls, frozen_norms: FrozenNorms = FrozenNorms.NONE) -> "ResNetConfig":
         """The 34-layer network of the paper."""
-        return cls(blocks=(3, 4, 6, 3), channels=(64, 128, 256, 512), bottleneck=False)
+        return cls((3, 4, 6, 3), (64, 128, 256, 512), bottleneck=False, frozen_norms=frozen_norms)
 
     @classmethod
     def resnet50(cls) -> "ResNetConfig":
@@ -162,7 +171,7 @@ class RootConfig:
             self.num_joints in (1, NUM_JOINTS),
             f"`num_joints` must be 1 (the root) or {NUM_JOINTS} (all joints); got {self.num_joints}",
         )
-        _require_counts(self, "stride")
+        require_counts(self, "stride")
 
     @property
     def pooling(self) -> int:
@@ -222,7 +231,7 @@ class BasisConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_points")
+        require_counts(self, "num_points")
         require(
             0 < self.radius < math.inf, f"`radius` must be positive and finite, metres; got {self.radius}"
         )
@@ -304,8 +313,8 @@ class DecoderConfig:
     output: DecoderOutput = DecoderOutput.OFFSETS
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
-        _require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
+        require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
+        require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
         require(0 <= self.dropout < 1, f"`dropout` must be in [0, 1); got {self.dropout}")
         require(
             self.layer is Design.PAPER or self.num_neighbours <= NUM_QUERIES,
@@ -401,7 +410,7 @@ class Config(ModelConfig):
     decoder: DecoderConfig = DecoderConfig()
 
     def __post_init__(self) -> None:
-        _require_counts(self, "image_hw", "width")
+        require_counts(self, "image_hw", "width")
         require(
             isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
             f"`image_hw` must be (height, width); got {self.image_hw}",
