@@ -20,7 +20,8 @@ from poem_jax.models.config import Config
 from poem_jax.models.hand_output import first_queries
 from poem_jax.models.heat_maps import root_point, triangulate_joints
 from poem_jax.models.layers import NormMode
-from poem_jax.models.network import ViewFeatures, assemble, number_type
+from poem_jax.models.network import assemble, number_type
+from poem_jax.models.poem_v2 import ViewFeatures
 from poem_jax.models.world_frame import Reconstruction, enter_working_frame, leave_working_frame
 from poem_jax.synthetic.dataset import SyntheticSample
 from poem_jax.typing import Array, Float, Num, Params
