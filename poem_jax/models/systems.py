@@ -5,8 +5,10 @@ A system is a config class (`ModelConfig` in `config.py` says what it tells) and
 """
 
 from poem_jax.models.config import Config, ModelConfig
+from poem_jax.models.mesh_transformer_config import MeshTransformerConfig
 
 MODULES: dict[type[ModelConfig], str] = {
     Config: "poem_jax.models.poem_v2:Poem",
+    MeshTransformerConfig: "poem_jax.models.mesh_transformers:MeshTransformer",
 }
 """`file:class` of the module, by config class, whose name is the `kind` of saved configs."""
