@@ -54,6 +54,14 @@ class Stem(enum.StrEnum):
     """4 x 4 pixels become 48 channels, then one 3 x 3 convolution: far cheaper on a CPU."""
 
 
+class FrozenNorms(enum.StrEnum):
+    """Which of a ResNet's batch norms keep what they were pre-trained to."""
+
+    NONE = "none"
+    STAGE_STARTS = "stage_starts"
+    """That of the stem, and all in the first block of every stage (the v1 release)."""
+
+
 @dataclass(frozen=True)
 class HRNetConfig:
     """HRNet classification trunk (Wang et al. 2020): four parallel branches of strides 4, 8, 16, 32."""
@@ -93,6 +101,7 @@ class ResNetConfig:
     bottleneck: bool = True
     stem: Stem = Stem.CONVOLUTION
     stem_channels: int = 64
+    frozen_norms: FrozenNorms = FrozenNorms.NONE
 
     def __post_init__(self) -> None:
         require(
@@ -113,9 +122,9 @@ class ResNetConfig:
         return cls(blocks=(2, 2, 2, 2), channels=(64, 128, 256, 512), bottleneck=False)
 
     @classmethod
-    def resnet34(cls) -> "ResNetConfig":
+    def resnet34(cls, frozen_norms: FrozenNorms = FrozenNorms.NONE) -> "ResNetConfig":
         """The 34-layer network of the paper."""
-        return cls(blocks=(3, 4, 6, 3), channels=(64, 128, 256, 512), bottleneck=False)
+        return cls((3, 4, 6, 3), (64, 128, 256, 512), bottleneck=False, frozen_norms=frozen_norms)
 
     @classmethod
     def resnet50(cls) -> "ResNetConfig":

@@ -79,20 +79,27 @@ def convolution(source: str, path: str, index: tuple[int, ...] = (), *, bias: bo
         yield NameRow(f"{source}.bias", f"trainable.{path}.bias", index=index)
 
 
-def batch_norm(source: str, path: str, index: tuple[int, ...] = ()) -> NameRows:
-    """List a batch norm."""
-    for name, ours in (("weight", "trainable.{}.scale"), ("bias", "trainable.{}.bias")):
-        yield NameRow(f"{source}.{name}", ours.format(path), index=index)
+def batch_norm(source: str, path: str, index: tuple[int, ...] = (), *, frozen: bool = False) -> NameRows:
+    """List a batch norm; all of a frozen one is among the statistics."""
+    group = "statistics" if frozen else "trainable"
+    for name, ours in (("weight", "scale"), ("bias", "bias")):
+        yield NameRow(f"{source}.{name}", f"{group}.{path}.{ours}", index=index)
     for name, ours in (("running_mean", "statistics.{}.mean"), ("running_var", "statistics.{}.variance")):
         yield NameRow(f"{source}.{name}", ours.format(path), index=index)
 
 
 def conv_norm(
-    conv: str, norm: str, path: str, index: tuple[int, ...] = (), *, bias: bool = False
+    conv: str,
+    norm: str,
+    path: str,
+    index: tuple[int, ...] = (),
+    *,
+    bias: bool = False,
+    frozen: bool = False,
 ) -> NameRows:
     """List a convolution and the batch norm that follows it."""
     yield from convolution(conv, f"{path}.conv", index, bias=bias)
-    yield from batch_norm(norm, f"{path}.norm", index)
+    yield from batch_norm(norm, f"{path}.norm", index, frozen=frozen)
 
 
 def read_rows(
