@@ -332,7 +332,7 @@ def _read(prepared, inputs):
 def _decode(prepared, inputs):
     start, tokens = inputs
     points = prepared.params["constants"]["basis_points"] / prepared.config.basis.radius
-    return _module(prepared).decoder(start, points, tokens, prepared.first)
+    return _module(prepared).decoder(start, points, tokens, prepared.constant["first"])
 
 
 def _module(prepared):

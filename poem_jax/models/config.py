@@ -1,13 +1,14 @@
-"""Configuration of a POEM model: frozen dataclasses nested by owner.
+"""Configuration of the models: what every system's says, `ModelConfig`, and that of POEM v2, `Config`.
 
-Where the paper and the released models differ in a whole part, the part names its `Design`; single choices
-are fields of the part that has them. Cross-field rules are checked on construction.
+Frozen dataclasses nested by owner; the other systems have a file each for theirs. Where the paper and the
+released models differ in a whole part, the part names its `Design`; single choices are fields of the part
+that has them. Cross-field rules are checked on construction.
 """
 
 import enum
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, QueryOrder
 
@@ -339,9 +340,61 @@ class CropConfig:
         require(0 < self.ratio < math.inf, f"`ratio` must be positive and finite; got {self.ratio}")
 
 
+class GridDraw(NamedTuple):
+    """Basis points that are drawn anew for every sample from the grids before the cameras."""
+
+    num_points: int
+    """How many are drawn."""
+    points_per_view: int
+    """Grid points of one camera."""
+
+
+class ModelConfig:
+    """What every system's configuration tells the code that runs them all (`network`, `apply`, `infer`, ...).
+
+    The configs are frozen dataclasses that inherit from this class. A property below holds for most systems;
+    one for which it does not overrides it.
+    """
+
+    image_hw: tuple[int, int]
+    image_mean: float
+    image_std: float
+    crop: CropConfig
+
+    @property
+    def query_order(self) -> QueryOrder:
+        """Layout of the 799 query points."""
+        raise NotImplementedError(f"{type(self).__name__} must say its `query_order`")
+
+    @property
+    def triangulates(self) -> bool:
+        """Whether the hand's place comes from rays of two views or more, of heat maps that the system has."""
+        return False
+
+    @property
+    def takes_root(self) -> bool:
+        """Whether `root_world` may be given; it then stands in for the triangulated root."""
+        return False
+
+    @property
+    def grid_draw(self) -> GridDraw | None:
+        """How basis points are drawn from the cameras' grids; None = they are not."""
+        return None
+
+    @property
+    def required_views(self) -> int | None:
+        """The one number of views that the layers are made for, all of them valid; None = any number."""
+        return None
+
+    @property
+    def couples_samples(self) -> bool:
+        """Whether a sample's result depends on the other samples of its batch."""
+        return False
+
+
 @dataclass(frozen=True)
-class Config:
-    """A whole model."""
+class Config(ModelConfig):
+    """A whole POEM v2 model."""
 
     image_hw: tuple[int, int] = (256, 256)
     image_mean: float = 0.5
@@ -410,3 +463,18 @@ class Config:
             self.decoder.first_queries is FirstQueries.TEMPLATE or self.root.num_joints == NUM_JOINTS,
             f"`first_queries` = joints needs `root.num_joints` = {NUM_JOINTS}; got {self.root.num_joints}",
         )
+
+    @property
+    def query_order(self) -> QueryOrder:
+        """Layout of the 799 query points."""
+        return self.decoder.query_order
+
+    @property
+    def triangulates(self) -> bool:
+        """The root, at least, is triangulated."""
+        return True
+
+    @property
+    def takes_root(self) -> bool:
+        """A known root stands in for the triangulated one."""
+        return True

@@ -20,6 +20,7 @@ from poem_jax.models.config import (
     FeatureConfig,
     FirstQueries,
     HeatActivation,
+    ModelConfig,
     ResNetConfig,
     RootConfig,
     Similarity,
@@ -84,7 +85,7 @@ V2_NANO = Config(
     basis=BasisConfig(num_points=2048),
 )
 
-PRESETS = {
+PRESETS: dict[str, ModelConfig] = {
     "v2-small": V2_SMALL,
     "v2-base": V2_BASE,
     "v2-large": V2_LARGE,
@@ -98,7 +99,7 @@ PRESETS = {
 }
 
 
-def preset(name: str) -> Config:
+def preset(name: str) -> ModelConfig:
     """Return the configuration of a named model.
 
     Raises:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from poem_jax.hand import mano_file
-from poem_jax.hand.model import HandModel
+from poem_jax.hand.model import HandModel, template_queries
 from poem_jax.hand.topology import (
     NUM_FACES,
     NUM_POSE_FEATURES,
@@ -20,7 +20,6 @@ from poem_jax.hand.topology import (
     NUM_VERTICES,
 )
 from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.network import describe, with_static_indices
 from poem_jax.models.presets import preset
 from poem_jax.typing import Float, Int, Params

@@ -1,0 +1,12 @@
+"""Which module belongs to which configuration: the one list of the systems that this package has.
+
+A system is a config class (`ModelConfig` in `config.py` says what it tells) and one file with its module
+(`System` in `network.py` says what it has). Configs load without their modules.
+"""
+
+from poem_jax.models.config import Config, ModelConfig
+
+MODULES: dict[type[ModelConfig], str] = {
+    Config: "poem_jax.models.poem_v2:Poem",
+}
+"""`file:class` of the module, by config class, whose name is the `kind` of saved configs."""
