@@ -219,8 +219,10 @@ def _moved(mesh: HandMesh, offset: Float[Array, "*batch 3"]) -> HandMesh:
     return HandMesh(mesh.vertices + offset[..., None, :], mesh.joints + offset[..., None, :])
 
 
-def template_queries(hand: HandModel, order: QueryOrder) -> Float[Array, "799 3"]:
-    """Return the flat mean hand about its root joint, metres."""
+def template_queries(
+    hand: HandModel, order: QueryOrder, *, center_joint: int = ROOT_JOINT
+) -> Float[Array, "799 3"]:
+    """Return the flat mean hand about its root joint, or another (OpenPose order), metres."""
     dtype = hand.v_template.dtype
     zero_pose, mean_shape = np.zeros((NUM_SKELETON_JOINTS, 3), dtype), np.zeros(NUM_SHAPES, dtype)
-    return join_queries(*hand_mesh(hand, zero_pose, mean_shape, center_joint=ROOT_JOINT), order)
+    return join_queries(*hand_mesh(hand, zero_pose, mean_shape, center_joint=center_joint), order)

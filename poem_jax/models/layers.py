@@ -248,6 +248,13 @@ def normal(key: PRNGKeyArray, shape: tuple[int, ...], scale: float = 1.0) -> Flo
     return jnp.asarray(scale * _numpy_generator(key).standard_normal(shape, np.float32))
 
 
+def uniform(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:
+    """Draw evenly from [0, 1)."""
+    if isinstance(key, Tracer):
+        return jax.random.uniform(key, shape, jnp.float32)
+    return jnp.asarray(_numpy_generator(key).random(shape, np.float32))
+
+
 def he_normal(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:
     """Draw weights (..., c_out) from N(0, 2 / fan-in) (He et al. 2015)."""
     return normal(key, shape, math.sqrt(2 / math.prod(shape[:-1])))
