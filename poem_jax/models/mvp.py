@@ -7,9 +7,9 @@ view, the views side by side, feed-forward network], after each of which every j
 together give pose and shape of the hand -> [joints, mesh] of every layer.
 
 Mean features and what is read of the views stand side by side before a linear layer, in MvP and in the
-release. So the model takes `num_views` views, neither more nor fewer. What a masked view holds does not matter:
-the valid views of a sample fill the first places in their order, whichever they are, and the other places
-hold zeros. Another order of the valid views gives another result.
+release. So the model takes `num_views` views, neither more nor fewer. What a masked view holds does not
+matter: the valid views of a sample fill the first places in their order, whichever they are, and the other
+places hold zeros. Another order of the valid views gives another result.
 
 The paper says no more than that MvP regresses MANO's parameters; `Design.PAPER` is MvP's own article, with
 this house's choices where it is silent, `Design.RELEASE` is the authors' code. They differ in:
@@ -469,9 +469,9 @@ def release_mesh(mesh: HandMesh, shares: Float[Array, "*batch 21 3"], config: Mv
 def finger_directions(hand: HandModel) -> Float[np.ndarray, "15 45"]:
     """Return an orthonormal basis of finger poses of any hand, for models that are trained anew.
 
-    Each finger has three directions in the space of its joints' axis-angle vectors (45 numbers, MANO's order):
-    its first joint bends, its first joint spreads, and its other two joints bend together. MANO's own are
-    the first 15 principal components of scanned poses, which released weights bring along.
+    Each finger has three directions in the space of its joints' axis-angle vectors (45 numbers, MANO's
+    order): its first joint bends, its first joint spreads, and its other two joints bend together. MANO's own
+    are the first 15 principal components of scanned poses, which released weights bring along.
     """
     flexion, abduction, _ = np.moveaxis(anatomical_axes(hand), 1, 0)
     basis = np.zeros((NUM_FINGERS, 3, NUM_FINGERS, 3, 3))

@@ -222,7 +222,8 @@ def loss_and_slopes(
     weights: Any, T: Any, graph: Any, rest: Any, images: Any, cams: Cameras, target: Any, key: Any
 ) -> Any:
     """Distance of all points of the mesh, and of the joints from its middle."""
-    model: Mvp = nnx.merge(graph, weights, rest)
+    # Copies, which the norms may move in this trace.
+    model: Mvp = nnx.merge(graph, weights, jax.tree.map(jnp.asarray, rest))
     frame = enter_working_frame(images, cams._replace(T_cam_from_world=T), None, np.float32)
     mode = NormMode(jnp.reshape(frame.cams.view_mask, -1))
     found = reconstruct(model, images, frame, mode, Draw(), key)
@@ -377,7 +378,7 @@ def test_deformed_samples_are_read_where_told():
         levels.append(jnp.asarray(np.concatenate([share, share + 10], -1), jnp.float32)[None])
     locations = rng.uniform(0.2, 0.8, (1, 5, 2, 2, 3, 2)).astype(np.float32)
     weights = rng.dirichlet(np.ones(6), (1, 5, 2)).reshape(1, 5, 2, 2, 3).astype(np.float32)
-    read = np.asarray(sample_deformed(tuple(levels), locations, weights)).reshape(1, 5, 2, 2)
+    read = np.asarray(jax.jit(sample_deformed)(tuple(levels), locations, weights)).reshape(1, 5, 2, 2)
     expected = (weights[..., None] * locations).sum((3, 4)) + np.array([0, 10])[:, None]
     np.testing.assert_allclose(read, expected, atol=1e-5)
 
@@ -385,7 +386,7 @@ def test_deformed_samples_are_read_where_told():
 def test_outside_the_maps_there_are_zeros():
     maps = (jnp.ones((1, 4, 4, 2)),)
     far = np.full((1, 1, 1, 1, 1, 2), 7.0, np.float32)
-    assert (np.asarray(sample_deformed(maps, far, np.ones((1, 1, 1, 1, 1), np.float32))) == 0).all()
+    assert (np.asarray(jax.jit(sample_deformed)(maps, far, np.ones((1, 1, 1, 1, 1), np.float32))) == 0).all()
 
 
 # The hand.
@@ -426,7 +427,7 @@ def test_the_paper_s_parameters_are_its_mesh(make_scene):
 
 
 def test_the_release_stretches_its_mesh_with_the_cuboid():
-    """Metres of the hand are taken for shares; in the paper's form the cuboid only says where the wrist is."""
+    """Metres of the hand are taken for shares; in the paper's form the cuboid says where the wrist is."""
     hand = default_hand()
     mesh = hand_mesh(hand, np.zeros((16, 3), np.float32), np.zeros(10, np.float32), center_joint=WRIST)
     config = replace(PAPER, cuboid=Cuboid((0.0, 0.0, 0.0), (2.4, 2.4, 1.8)))

@@ -19,6 +19,7 @@ from flax import nnx
 
 from poem_jax.batch import Prediction
 from poem_jax.evaluation.metrics import evaluate
+from poem_jax.hand.topology import split_queries
 from poem_jax.losses import MVP, multi_view_losses
 from poem_jax.models import mvp
 from poem_jax.models.config import Design, FrozenNorms, ResNetConfig
@@ -276,15 +277,16 @@ def losses(model: str) -> dict[str, float]:
         )
     )
 
-    def compare(layers: slice) -> tuple[Any, dict]:
-        shown = prediction._replace(layers_world=prediction.layers_world[:, layers])
-        return evaluate_loss(shown, batch, hand=hand())
+    def of_layer(i: int) -> float:
+        vertices, joints = split_queries(prediction.layers_world[:, i], config.query_order)
+        alone = prediction.layers_world[:, i : i + 1]
+        shown = prediction._replace(layers_world=alone, vertices_world=vertices, joints_world=joints)
+        return float(evaluate_loss(shown, batch, hand=hand())[0])
 
-    loss, terms = compare(slice(None))
+    loss, terms = evaluate_loss(prediction, batch, hand=hand())
     named = {f"loss/loss_{theirs}": float(terms[ours]) for theirs, ours in TERMS.items()}
-    for i in LAYERS:
-        named[f"loss/dec{i}_loss_recon"] = float(compare(slice(i, i + 1))[0])
-    return named | {"loss/loss": float(loss), "loss/loss_recon": float(loss)}
+    named |= {f"loss/dec{i}_loss_recon": of_layer(i) for i in LAYERS}
+    return named | {"loss/loss": float(loss), "loss/loss_recon": named["loss/dec5_loss_recon"]}
 
 
 def check_loss(model: str, key: str) -> None:
