@@ -37,7 +37,6 @@ from poem_jax.weights import store
 
 MAX_BATCH = 4
 """Hands at a time: enough to keep two cores busy, little enough to wait for."""
-_WORDS = {1: "one is", 2: "two are"}
 UNDETERMINED = (
     "the views do not determine where the hand is: they stand at one place, or their rays do not cross"
 )
@@ -101,7 +100,7 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
 
 def views_needed(config: ModelConfig) -> int:
     """Return how many views must see a hand before a model can place it."""
-    return config.required_views or (2 if config.triangulates else 1)
+    return 2 if config.triangulates else 1
 
 
 def _if_enough(crops: HandCrops | None, config: ModelConfig) -> HandCrops | None:
@@ -151,9 +150,8 @@ def _result(
         return known
     views = int(crops.view_mask.sum())
     if views < needed:
-        return HandResult(
-            crops.view_mask, f"seen in {views} view(s); {_WORDS.get(needed, f'{needed} are')} needed"
-        )
+        wanted = "two are" if needed == 2 else "one is"
+        return HandResult(crops.view_mask, f"seen in {views} view(s); {wanted} needed")
     if predicted is None or not predicted.valid:
         return HandResult(crops.view_mask, UNDETERMINED)
     if side == "left":

@@ -6,6 +6,7 @@ the paper's structure (the template first, sigmoid maps of the release's 21 join
 every layer, the primary view's similarities) on a small trunk; `tiny`, on the same trunk, is ours, for a CPU.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from poem_jax.hand.topology import NUM_JOINTS
@@ -97,6 +98,39 @@ PRESETS: dict[str, ModelConfig] = {
     "v2-nano": V2_NANO,
     "tiny": TINY,
 }
+
+
+DATASETS = ("dexycb", "ho3d", "oakink")
+"""Whose captures the released models of POEM v1 and its baselines were trained on."""
+
+
+def released(variant: str, *, dataset: str = "dexycb", num_views: int = 8) -> ModelConfig:
+    """Return the configuration of a released model.
+
+    Args:
+        variant: one of `RELEASED`.
+        dataset: one of `DATASETS`: of POEM v1 and the baselines, what it was trained on; of no account for
+            POEM v2.
+        num_views: views that the layers of MvP are made for; of no account for the others.
+
+    Raises:
+        ValueError: no such variant or data set.
+    """
+    if variant not in RELEASED:
+        raise ValueError(f"`variant` must be one of {', '.join(RELEASED)}; got {variant!r}")
+    if dataset not in DATASETS:
+        raise ValueError(f"`dataset` must be one of {', '.join(DATASETS)}; got {dataset!r}")
+    return RELEASED[variant](dataset, num_views)
+
+
+def _preset_of(variant: str) -> Callable[[str, int], ModelConfig]:
+    return lambda dataset, num_views: preset(f"{variant}-release")
+
+
+RELEASED: dict[str, Callable[[str, int], ModelConfig]] = {
+    variant: _preset_of(variant) for variant in ("v2-small", "v2-medium", "v2-large", "v2-medium-mano")
+}
+"""How to make the config of each released model, of a data set and a number of views."""
 
 
 def preset(name: str) -> ModelConfig:

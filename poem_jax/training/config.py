@@ -225,12 +225,12 @@ class TrainConfig:
             f"`first_stage_steps` must be 0 for a {type(self.model).__name__} without a first stage; "
             f"got {self.first_stage_steps}",
         )
-        needed = self.model.required_views
-        counts = {n for shape in self.data.batches for n in (shape.num_views, shape.min_views) if n}
+        least, most = self.model.view_range
+        counts = {shape.num_views for shape in self.data.batches}
         counts |= set(run.validation_views) if run.validate_every else set()
         require(
-            needed is None or counts == {needed},
-            f"this {type(self.model).__name__} is made for {needed} views, in `data.batches` and "
+            all(least <= n <= (most or n) for n in counts),
+            f"this {type(self.model).__name__} is made for {least} to {most} views, in `data.batches` and "
             f"`train.validation_views` alike; got {sorted(counts)}",
         )
         max_views = max(shape.num_views for shape in self.data.batches)
