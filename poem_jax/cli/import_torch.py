@@ -20,7 +20,20 @@ class ImportTorch:
 
     checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CKPT")]
     """The released .pth.tar."""
-    variant: Literal["v2-small", "v2-medium", "v2-large", "v2-medium-mano"]
+    variant: Literal[
+        "v2-small",
+        "v2-medium",
+        "v2-large",
+        "v2-medium-mano",
+        "v1",
+        "v1-g-emb",
+        "v1-gv-emb",
+        "v1-full-emb",
+        "v1-wo-proj",
+        "pe-meshtr",
+        "ftl-meshtr",
+        "mvp",
+    ]
     """Which of the released models it is."""
     mano: File
     """MANO_RIGHT.pkl from mano.is.tue.mpg.de, or an npz with MANO's names."""

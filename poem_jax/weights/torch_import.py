@@ -23,7 +23,10 @@ from poem_jax.hand.topology import (
     NUM_VERTICES,
 )
 from poem_jax.models.config import Config, HRNetConfig, ModelConfig, ResNetConfig
+from poem_jax.models.mesh_transformer_config import MeshTransformerConfig
+from poem_jax.models.mvp_config import MvpConfig
 from poem_jax.models.network import constants_of, describe, with_static_indices
+from poem_jax.models.poem_v1_config import PoemV1Config
 from poem_jax.models.presets import DATASETS, RELEASED, released
 from poem_jax.typing import Float, Int, Params
 from poem_jax.weights.name_table import NameRow, read_rows, write_rows
@@ -34,7 +37,12 @@ from poem_jax.weights.trunk_keys import trunk_rows
 VARIANTS = tuple(RELEASED)
 """The released models; of POEM v2 each is the preset of that name with the suffix `-release`."""
 
-KEYS: dict[type[ModelConfig], str] = {Config: "poem_jax.weights.release_keys"}
+KEYS: dict[type[ModelConfig], str] = {
+    Config: "poem_jax.weights.release_keys",
+    PoemV1Config: "poem_jax.weights.v1_poem_keys",
+    MeshTransformerConfig: "poem_jax.weights.v1_mesh_keys",
+    MvpConfig: "poem_jax.weights.v1_mvp_keys",
+}
 """The file with the table of names of each system, by config class. It has `used_rows`,
 `unused_shapes` and `hand_prefixes`, and may have `constant_rows` (what of a MANO asset goes beyond a hand
 model) and `aliases` (further names of arrays; `unused_shapes` names them too)."""
