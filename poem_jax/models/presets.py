@@ -7,8 +7,8 @@ every layer, the primary view's similarities) on a small trunk; `tiny`, on the s
 
 `v1` and its ablations `v1-1stage`, `v1-wo-proj`, `v1-wo-pt`, `v1-g-emb`, `v1-gv-emb`, and the baselines
 `pe-meshtr`, `ftl-meshtr` and `mvp` are the paper's. The authors released `v1-release-dexycb` and so on, of
-three data sets, and `pe-meshtr-release`, `ftl-meshtr-release`, `mvp-release`, here of DexYCB; `released` gives
-every released model of every data set.
+three data sets, and `pe-meshtr-release`, `ftl-meshtr-release`, `mvp-release`, here of DexYCB; `released`
+gives every released model of every data set.
 """
 
 from collections.abc import Callable
