@@ -91,9 +91,9 @@ class MvpConfig(ModelConfig):
         return QueryOrder.JOINTS_FIRST if self.design is Design.RELEASE else QueryOrder.VERTICES_FIRST
 
     @property
-    def required_views(self) -> int:
-        """As many as its layers are made for; some may be masked."""
-        return self.num_views
+    def view_range(self) -> tuple[int, int]:
+        """As many as its layers are made for, masked ones counted."""
+        return self.num_views, self.num_views
 
     @property
     def couples_samples(self) -> bool:
