@@ -120,12 +120,10 @@ class Mvp(nnx.Module):
         mode: NormMode,
         *,
         dropout_key: PRNGKeyArray | None = None,
-        ball_index: Any = None,
-        key: PRNGKeyArray | None = None,
     ) -> Prediction:
         """Join what was seen in the views (batch, view) to one hand per sample, in the user's world.
 
-        A sample is valid if any of its views is. `mode`, `ball_index` and `key` are not used.
+        A sample is valid if any of its views is. `mode` is not used: nothing here has a batch norm.
 
         Raises:
             ValueError: another number of views than the config's, masked ones counted.

@@ -25,8 +25,10 @@ from poem_jax.models.layers import NormMode
 from poem_jax.models.mvp import (
     Mvp,
     PaperProjectiveAttention,
+    Places,
     ReleaseProjectiveAttention,
     Scene,
+    ViewLevels,
     finger_directions,
     paper_mesh,
     paper_places,
@@ -34,6 +36,7 @@ from poem_jax.models.mvp import (
     release_mesh,
     release_places,
     release_rays,
+    view_scene,
 )
 from poem_jax.models.mvp_config import MvpConfig, MvpDecoderConfig
 from poem_jax.models.network import Draw, reconstruct
@@ -354,9 +357,30 @@ def test_release_places_are_shares_of_the_largest_number_in_the_batch(make_scene
     assert places[np.asarray(cams.view_mask)].max() == 1
 
 
+def test_masked_views_are_zeros_after_the_valid_ones(config, make_scene):
+    _, cams = make_scene(1, VIEWS)
+    frame = in_primary(cams._replace(view_mask=np.array([[0, 1, 0, 1]], bool)))
+    rng = np.random.default_rng(0)
+    seen = ViewLevels(
+        tuple(rng.normal(size=(1, VIEWS, n, n, config.width)).astype(np.float32) for n in (2, 4, 8))
+    )
+    scene = view_scene(config, seen, frame)
+    np.testing.assert_array_equal(scene.cams.view_mask, [[True, True, False, False]])
+    for ours, level in zip(scene.levels, seen.levels, strict=True):
+        np.testing.assert_array_equal(ours[:, :2], level[:, [1, 3]])
+        assert not np.asarray(ours[:, 2:]).any()
+    queries = rng.normal(size=(1, 21, config.width)).astype(np.float32)
+    everywhere = Places(
+        np.full((1, VIEWS, 21, 3, 2), 0.5, np.float32), np.array([[[True] * 21] * 2 + [[False] * 21] * 2])
+    )
+    read = np.asarray(made(config).layers[0].projective_attention(queries, everywhere, scene))
+    assert np.abs(read[:, :2]).min(-1).max() > 0
+    assert not read[:, 2:].any()
+
+
 def test_the_release_reads_levels_and_heads_out_of_order():
+    # Of 3 levels, 2 heads and 4 points; a number tells its level and place.
     numbers = jnp.arange(3 * 8.0).reshape(1, 1, 1, 3, 8)
-    """Of 3 levels, 2 heads and 4 points; a number tells its level and place."""
     decoder = replace(PAPER.decoder, num_points=4)
     paper, release = (
         kind(decoder, 16, rngs=nnx.Rngs(0))._by_head(numbers, 1)[0, 0, 0, ..., 0]
