@@ -43,7 +43,6 @@ from poem_jax.hand.model import HandModel, template_queries
 from poem_jax.hand.topology import NUM_QUERIES, WRIST
 from poem_jax.models.backbones import ResNet
 from poem_jax.models.config import Design
-from poem_jax.models.constants import HandConstants
 from poem_jax.models.detr import DetrDecoder
 from poem_jax.models.frustum import (
     denormalised,
@@ -60,6 +59,7 @@ from poem_jax.models.mesh_transformer_config import (
     MeshTransformerConfig,
     PositionEmbeddedFusion,
 )
+from poem_jax.models.network import HandConstants
 from poem_jax.models.point_features import valid_views_first
 from poem_jax.models.world_frame import Reconstruction, WorkingFrame, leave_working_frame
 from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
