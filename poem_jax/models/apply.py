@@ -124,11 +124,12 @@ def check_inputs(
 
 def check_view_count(config: ModelConfig, num_views: int, name: str = "`views`") -> None:
     """Raise `ValueError` for a padded number of views that a system cannot take; `name` is what has them."""
-    needed = config.required_views
-    if needed is not None and num_views != needed:
+    least, most = config.view_range
+    if num_views < least or (most is not None and num_views > most):
+        wanted = f"{least}" if least == most else f"{least} to {most}"
         raise ValueError(
-            f"{name} must have {needed} views, as the layers of this {type(config).__name__} are made for; "
-            f"got {num_views}. Give {needed} views, or take a model for {num_views}"
+            f"{name} must have {wanted} views, as the layers of this {type(config).__name__} are made for; "
+            f"got {num_views}. Leave views out, pad with masked ones, or take a model for {num_views}"
         )
 
 
@@ -145,10 +146,16 @@ def _check_taken(config: ModelConfig, *, root_world: Any, ball_index: Any, key: 
                 f"`{name}` must be None for this {system}, which draws no points from the cameras' grids; "
                 "leave it out"
             )
-    if key is not None and not (
-        isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.shape
-    ):
-        raise ValueError(f"`key` must be one key of `jax.random.key`; got {key!r}")
+    if key is not None and not _is_one_key(key):
+        raise ValueError(f"`key` must be one key of `jax.random`; got {key!r}")
+
+
+def _is_one_key(key: Any) -> bool:
+    """Whether this is a key of `jax.random.key`, or one of the older `jax.random.PRNGKey`."""
+    if not isinstance(key, jax.Array):
+        return False
+    typed = jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return key.shape == () if typed else key.dtype == np.uint32 and key.ndim == 1
 
 
 def _check_ball_index(ball_index: Any, batch: int, num_views: int, draw: GridDraw) -> None:
@@ -206,12 +213,6 @@ def _check_view_counts(cams: Cameras, root_world: Array | None, config: ModelCon
         raise ValueError(
             f"every sample needs at least one valid view; `cams.view_mask` of samples {_where(counts == 0)} "
             "is all False. Drop these samples."
-        )
-    if config.required_views is not None and (counts < config.required_views).any():
-        raise ValueError(
-            f"every view must be valid, as the layers of this {type(config).__name__} are made for exactly "
-            f"{config.required_views}; `cams.view_mask` of samples {_where(counts < config.required_views)} "
-            "holds False. Drop these samples, or take a system for any number of views"
         )
     if not config.triangulates:
         return

@@ -382,9 +382,9 @@ class ModelConfig:
         return None
 
     @property
-    def required_views(self) -> int | None:
-        """The one number of views that the layers are made for, all of them valid; None = any number."""
-        return None
+    def view_range(self) -> tuple[int, int | None]:
+        """Least and most views that the layers are made for, masked ones counted; None = any number."""
+        return 1, None
 
     @property
     def couples_samples(self) -> bool:

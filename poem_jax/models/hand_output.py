@@ -15,7 +15,6 @@ from flax import nnx
 
 from poem_jax.geometry.transforms import matmul, rotation_from_6d, smallest_rotation, transpose
 from poem_jax.hand.model import HandMesh, HandModel, PosedHand
-from poem_jax.hand.model import template_queries as template_queries
 from poem_jax.hand.topology import (
     NUM_QUERIES,
     NUM_SHAPES,

@@ -44,8 +44,8 @@ class Prepared:
     """A model ready for inference: its parameters, and what does not depend on the images."""
 
     params: Params
-    constant: dict[str, PyTree]
-    """Arguments of `find_hands` that do not depend on the images."""
+    constant: dict[str, PyTree] | None
+    """Arguments of `find_hands` that do not depend on the images, if the system has any."""
     config: ModelConfig
 
 
@@ -212,7 +212,7 @@ def _find(prepared: Prepared, given: tuple[_Samples, PRNGKeyArray | None]) -> Pr
     (seen, frame, ball_index), key = given
     model = network.assemble(prepared.config, prepared.params)
     draw = network.Draw(ball_index, key)
-    return model.find_hands(seen, frame, NormMode(), **prepared.constant, **draw.arguments())
+    return model.find_hands(seen, frame, NormMode(), **(prepared.constant or {}), **draw.arguments())
 
 
 @functools.cache
@@ -223,9 +223,9 @@ def _cpu_program(function: Callable, one_thread: bool) -> Callable:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _constant(params: Params, config: ModelConfig) -> dict[str, PyTree]:
+def _constant(params: Params, config: ModelConfig) -> dict[str, PyTree] | None:
     model = network.assemble(config, params)
-    return model.prepared() if isinstance(model, network.Prepares) else {}
+    return model.prepared() if isinstance(model, network.Prepares) else None
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))

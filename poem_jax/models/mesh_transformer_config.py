@@ -111,6 +111,12 @@ class MeshTransformerConfig(ModelConfig):
         """Layout of the 799 queries."""
         return QueryOrder.JOINTS_FIRST if self.design is Design.RELEASE else QueryOrder.VERTICES_FIRST
 
+    @property
+    def view_range(self) -> tuple[int, int | None]:
+        """The paper's canonical fusion has weights for each view; the others take any number."""
+        limited = isinstance(self.fusion, CanonicalFusion) and self.design is Design.PAPER
+        return 1, self.fusion.num_views if limited else None
+
 
 PE_MESHTR = MeshTransformerConfig(fusion=PositionEmbeddedFusion())
 FTL_MESHTR = MeshTransformerConfig(fusion=CanonicalFusion())

@@ -193,6 +193,11 @@ def build(config: ModelConfig, rngs: nnx.Rngs, hand: HandModel | None = None) ->
     return module(config, default_hand() if hand is None else hand, rngs=rngs)
 
 
+def constants_of(config: ModelConfig, hand: HandModel) -> dict[str, Any]:
+    """Return the constants of a model with a certain hand, as in `params["constants"]`."""
+    return split(build(config, nnx.Rngs(0), hand))["constants"]
+
+
 def _home(config: ModelConfig) -> str:
     if type(config) not in MODULES:
         known = ", ".join(sorted(kind.__name__ for kind in MODULES))
