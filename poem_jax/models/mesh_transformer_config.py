@@ -114,8 +114,9 @@ class MeshTransformerConfig(ModelConfig):
     @property
     def view_range(self) -> tuple[int, int | None]:
         """The paper's canonical fusion has weights for each view; the others take any number."""
-        limited = isinstance(self.fusion, CanonicalFusion) and self.design is Design.PAPER
-        return 1, self.fusion.num_views if limited else None
+        if isinstance(self.fusion, CanonicalFusion) and self.design is Design.PAPER:
+            return 1, self.fusion.num_views
+        return 1, None
 
 
 PE_MESHTR = MeshTransformerConfig(fusion=PositionEmbeddedFusion())

@@ -246,17 +246,8 @@ class CanonicalMaps(nnx.Module):
         self.place_code = PlaceCode(self.width, rngs=rngs)
 
     def __call__(self, maps: Float[Array, "batch view h w c"], cams: Cameras, mode: NormMode) -> Tokens:
-        """Return the tokens.
-
-        Raises:
-            ValueError: more views than the convolution has weights for.
-        """
+        """Return the tokens; `config.view_range` says how many views there may be."""
         batch, view, h, w, _ = maps.shape
-        if view > self.num_views:
-            raise ValueError(
-                f"`views` must hold at most {self.num_views} views, as many as the model fuses; got {view}. "
-                "Leave views out, or train a model with more `fusion.num_views`"
-            )
         points = _per_image(self.to_points, maps, mode).reshape(batch, view, -1, 3)
         moved = transform_points(invert_rigid(cams.T_cam_from_world), points).reshape(batch, view, h, w, -1)
         canonical, cams = valid_views_first(moved, cams)
