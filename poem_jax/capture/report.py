@@ -90,7 +90,9 @@ class Report:
             bool(frame.problems) or any(hand.view_mask.any() for hand in frame.hands)
         )
         if frame.keypoints_px is None and self._against != _NOTHING:
-            no_maps = bool(solved) and not any(np.isfinite(hand.reprojection_px).any() for hand in solved)
+            no_maps = bool(solved) and all(
+                np.isnan(np.asarray(hand.reprojection_px, float)).all() for hand in solved
+            )
             self._against = _NOTHING if no_maps else "the model's own heat maps"
         self._errors += [np.asarray(hand.reprojection_px, np.float32) for hand in solved]
         self._views_used += sum(int(hand.view_mask.sum()) for hand in frame.hands)

@@ -164,7 +164,7 @@ class PoemV1(nnx.Module):
 
     def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
         scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.hand.v_template[...].dtype) / scale
+        images = jnp.asarray(views, self.hand.model().v_template.dtype) / scale
         return (images - self.config.image_mean) / self.config.image_std
 
 
