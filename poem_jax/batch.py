@@ -29,18 +29,23 @@ class MultiViewBatch(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """One hand per sample, in the world frame of the cameras that were given."""
+    """One hand per sample, in the world frame of the cameras that were given.
+
+    What a system does not have is None: POEM (v1, v2) has a root and key points, but v1's ablation of one
+    stage, PE-MeshTR, FTL-MeshTR and MvP have neither. `docs/models.md` says it for each.
+    """
 
     vertices_world: Float[Array, "batch 778 3"]
     joints_world: Float[Array, "batch 21 3"]
-    root_world: Float[Array, "batch 3"]
+    root_world: Float[Array, "batch 3"] | None
     """The point about which the second stage worked: triangulated, or as given."""
-    keypoints_px: Float[Array, "batch view joint 2"]
-    """Heat-map coordinates per view; one joint (the root) in the paper, 21 in the release."""
+    keypoints_px: Float[Array, "batch view joint 2"] | None
+    """Heat-map coordinates per view; one joint (the root) in POEM v2's paper, else 21."""
     layers_world: Float[Array, "batch layer 799 3"]
     """Query points after every decoder layer, in the preset's own query order."""
     valid: Bool[Array, " batch"]
-    """False where the sample could not be solved (no valid view, or one view and no root)."""
+    """False where the sample could not be solved (no valid view; one view and no root, where the system
+    triangulates; no basis point near the hand)."""
     heat_maps: Float[Array, "batch view joint h w"] | None = None
     """Where each view sees the joints of `keypoints_px`; every map sums to 1."""
     reference_joints_world: Float[Array, "batch 21 3"] | None = None

@@ -8,6 +8,8 @@ from poem_jax.typing import Array, Float, Int, Num
 
 _GROUP = 8
 """Points per group of the two-stage search."""
+_QUERIES_AT_A_TIME = 1024
+"""Queries that are searched together: of more, the distances to all points would fill the memory."""
 
 
 def nearest(
@@ -23,7 +25,18 @@ def nearest(
     num_points = points.shape[-2]
     if not 1 <= k <= num_points:
         raise ValueError(f"`k` must be between 1 and the number of points = {num_points}; got {k}")
-    negated = -_squared_distances(jax.lax.stop_gradient(queries), jax.lax.stop_gradient(points))
+    queries, points = jax.lax.stop_gradient(queries), jax.lax.stop_gradient(points)
+    part, rest = divmod(queries.shape[-2], _QUERIES_AT_A_TIME)
+    if part <= 1 or rest:
+        return _nearest(queries, points, k)
+    parts = jnp.moveaxis(queries.reshape(*queries.shape[:-2], part, _QUERIES_AT_A_TIME, 3), -3, 0)
+    found = jax.lax.map(lambda some: _nearest(some, points, k), parts)
+    return jnp.moveaxis(found, 0, -3).reshape(*queries.shape[:-1], k)
+
+
+def _nearest(queries: Array, points: Array, k: int) -> Int[Array, "*batch query k"]:
+    num_points = points.shape[-2]
+    negated = -_squared_distances(queries, points)
     if num_points % _GROUP or num_points < 4 * _GROUP * k:
         return jax.lax.top_k(negated, k)[1]
     groups = negated.reshape(*negated.shape[:-1], num_points // _GROUP, _GROUP)

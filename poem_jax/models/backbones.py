@@ -9,7 +9,7 @@ import numpy as np
 from flax import nnx
 from jax.core import Tracer
 
-from poem_jax.models.config import HRNetConfig, ResNetConfig, Stem
+from poem_jax.models.config import FrozenNorms, HRNetConfig, ResNetConfig, Stem
 from poem_jax.models.layers import ConvNorm, NormMode, repeat_pixels
 from poem_jax.typing import Array, Float
 
@@ -19,10 +19,13 @@ BOTTLENECK_EXPANSION = 4
 class BasicBlock(nnx.Module):
     """Two 3 x 3 convolutions around a shortcut."""
 
-    def __init__(self, c_in: int, c_out: int, stride: int = 1, *, rngs: nnx.Rngs) -> None:
-        self.first = ConvNorm(c_in, c_out, 3, stride, rngs=rngs)
-        self.second = ConvNorm(c_out, c_out, 3, relu=False, rngs=rngs)
-        self.shortcut = _projection(c_in, c_out, stride, rngs)
+    def __init__(
+        self, c_in: int, c_out: int, stride: int = 1, *, frozen: bool = False, rngs: nnx.Rngs
+    ) -> None:
+        """`frozen`: the batch norms are never trained."""
+        self.first = ConvNorm(c_in, c_out, 3, stride, frozen=frozen, rngs=rngs)
+        self.second = ConvNorm(c_out, c_out, 3, relu=False, frozen=frozen, rngs=rngs)
+        self.shortcut = _projection(c_in, c_out, stride, frozen, rngs)
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h2 w2 c2"]:
         """Apply the block."""
@@ -33,12 +36,15 @@ class BasicBlock(nnx.Module):
 class Bottleneck(nnx.Module):
     """1 x 1, 3 x 3 and 1 x 1 convolutions around a shortcut; the stride is in the 3 x 3."""
 
-    def __init__(self, c_in: int, c_out: int, stride: int = 1, *, rngs: nnx.Rngs) -> None:
+    def __init__(
+        self, c_in: int, c_out: int, stride: int = 1, *, frozen: bool = False, rngs: nnx.Rngs
+    ) -> None:
+        """`frozen`: the batch norms are never trained."""
         inner = c_out // BOTTLENECK_EXPANSION
-        self.reduce = ConvNorm(c_in, inner, 1, rngs=rngs)
-        self.middle = ConvNorm(inner, inner, 3, stride, rngs=rngs)
-        self.expand = ConvNorm(inner, c_out, 1, relu=False, rngs=rngs)
-        self.shortcut = _projection(c_in, c_out, stride, rngs)
+        self.reduce = ConvNorm(c_in, inner, 1, frozen=frozen, rngs=rngs)
+        self.middle = ConvNorm(inner, inner, 3, stride, frozen=frozen, rngs=rngs)
+        self.expand = ConvNorm(inner, c_out, 1, relu=False, frozen=frozen, rngs=rngs)
+        self.shortcut = _projection(c_in, c_out, stride, frozen, rngs)
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h2 w2 c2"]:
         """Apply the block."""
@@ -46,10 +52,10 @@ class Bottleneck(nnx.Module):
         return jax.nn.relu(y + (x if self.shortcut is None else self.shortcut(x, mode)))
 
 
-def _projection(c_in: int, c_out: int, stride: int, rngs: nnx.Rngs) -> ConvNorm | None:
+def _projection(c_in: int, c_out: int, stride: int, frozen: bool, rngs: nnx.Rngs) -> ConvNorm | None:
     if stride == 1 and c_in == c_out:
         return None
-    return ConvNorm(c_in, c_out, 1, stride, relu=False, rngs=rngs)
+    return ConvNorm(c_in, c_out, 1, stride, relu=False, frozen=frozen, rngs=rngs)
 
 
 _Carry = TypeVar("_Carry")
@@ -117,11 +123,12 @@ class ResNet(nnx.Module):
 
     def __init__(self, config: ResNetConfig, *, rngs: nnx.Rngs) -> None:
         make_stem = ConvolutionStem if config.stem is Stem.CONVOLUTION else SpaceToDepthStem
-        self.stem = make_stem(config.stem_channels, rngs=rngs)
+        frozen = config.frozen_norms is FrozenNorms.STAGE_STARTS
+        self.stem = make_stem(config.stem_channels, frozen=frozen, rngs=rngs)
         widths = (config.stem_channels, *config.channels)
         block = Bottleneck if config.bottleneck else BasicBlock
         self.stages = nnx.List(
-            Stage(block, widths[i], widths[i + 1], count, stride=1 if i == 0 else 2, rngs=rngs)
+            Stage(block, widths[i], widths[i + 1], count, stride=1 if i == 0 else 2, frozen=frozen, rngs=rngs)
             for i, count in enumerate(config.blocks)
         )
 
@@ -147,10 +154,12 @@ class Stage(nnx.Module):
         count: int,
         *,
         stride: int,
+        frozen: bool = False,
         rngs: nnx.Rngs,
     ) -> None:
+        """`frozen`: the first block's batch norms are never trained."""
         rest = [block(c_out, c_out, rngs=rngs) for _ in range(count - 1)]
-        self.blocks = nnx.List([block(c_in, c_out, stride, rngs=rngs), *rest])
+        self.blocks = nnx.List([block(c_in, c_out, stride, frozen=frozen, rngs=rngs), *rest])
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h2 w2 c2"]:
         """Apply the stage."""
@@ -162,8 +171,8 @@ class Stage(nnx.Module):
 class ConvolutionStem(nnx.Module):
     """7 x 7 convolution of stride 2 and 3 x 3 max pooling of stride 2."""
 
-    def __init__(self, channels: int, *, rngs: nnx.Rngs) -> None:
-        self.conv = ConvNorm(3, channels, 7, 2, rngs=rngs)
+    def __init__(self, channels: int, *, frozen: bool = False, rngs: nnx.Rngs) -> None:
+        self.conv = ConvNorm(3, channels, 7, 2, frozen=frozen, rngs=rngs)
 
     def __call__(self, images: Float[Array, "image h w 3"], mode: NormMode) -> Float[Array, "image h2 w2 c"]:
         """Reach a quarter of the resolution."""
@@ -175,8 +184,8 @@ class ConvolutionStem(nnx.Module):
 class SpaceToDepthStem(nnx.Module):
     """Every 4 x 4 pixels become one cell of 48 channels, then a 3 x 3 convolution."""
 
-    def __init__(self, channels: int, *, rngs: nnx.Rngs) -> None:
-        self.conv = ConvNorm(3 * _SPACE_TO_DEPTH**2, channels, 3, rngs=rngs)
+    def __init__(self, channels: int, *, frozen: bool = False, rngs: nnx.Rngs) -> None:
+        self.conv = ConvNorm(3 * _SPACE_TO_DEPTH**2, channels, 3, frozen=frozen, rngs=rngs)
 
     def __call__(self, images: Float[Array, "image h w 3"], mode: NormMode) -> Float[Array, "image h2 w2 c"]:
         """Reach a quarter of the resolution."""

@@ -1,13 +1,14 @@
-"""Configuration of a POEM model: frozen dataclasses nested by owner.
+"""Configuration of the models: what every system's says, `ModelConfig`, and that of POEM v2, `Config`.
 
-Where the paper and the released models differ in a whole part, the part names its `Design`; single choices
-are fields of the part that has them. Cross-field rules are checked on construction.
+Frozen dataclasses nested by owner; the other systems have a file each for theirs. Where the paper and the
+released models differ in a whole part, the part names its `Design`; single choices are fields of the part
+that has them. Cross-field rules are checked on construction.
 """
 
 import enum
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, QueryOrder
 
@@ -25,7 +26,7 @@ MAX_LAYERS = 256
 """Of layers, blocks or modules in a row; the largest model has 9."""
 
 
-def _require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
+def require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
     """Insist that fields are whole numbers from 1 to `most`, or tuples of at most `MAX_LAYERS` of them."""
     for name in names:
         value = getattr(owner, name)
@@ -54,6 +55,14 @@ class Stem(enum.StrEnum):
     """4 x 4 pixels become 48 channels, then one 3 x 3 convolution: far cheaper on a CPU."""
 
 
+class FrozenNorms(enum.StrEnum):
+    """Which of a ResNet's batch norms keep what they were pre-trained to."""
+
+    NONE = "none"
+    STAGE_STARTS = "stage_starts"
+    """That of the stem, and all in the first block of every stage (the v1 release)."""
+
+
 @dataclass(frozen=True)
 class HRNetConfig:
     """HRNet classification trunk (Wang et al. 2020): four parallel branches of strides 4, 8, 16, 32."""
@@ -68,8 +77,8 @@ class HRNetConfig:
     """Residual blocks in every branch of a module."""
 
     def __post_init__(self) -> None:
-        _require_counts(self, "width", "stem_channels")
-        _require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
+        require_counts(self, "width", "stem_channels")
+        require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
         require(self.stem_blocks >= 2, f"`stem_blocks` must be at least 2; got {self.stem_blocks}")
         require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 
@@ -94,14 +103,15 @@ class ResNetConfig:
     bottleneck: bool = True
     stem: Stem = Stem.CONVOLUTION
     stem_channels: int = 64
+    frozen_norms: FrozenNorms = FrozenNorms.NONE
 
     def __post_init__(self) -> None:
         require(
             len(self.blocks) == len(self.channels) >= 1,
             f"`blocks` and `channels` must name the same stages; got {self.blocks} and {self.channels}",
         )
-        _require_counts(self, "channels", "stem_channels")
-        _require_counts(self, "blocks", most=MAX_LAYERS)
+        require_counts(self, "channels", "stem_channels")
+        require_counts(self, "blocks", most=MAX_LAYERS)
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -114,9 +124,9 @@ class ResNetConfig:
         return cls(blocks=(2, 2, 2, 2), channels=(64, 128, 256, 512), bottleneck=False)
 
     @classmethod
-    def resnet34(cls) -> "ResNetConfig":
+    def resnet34(cls, frozen_norms: FrozenNorms = FrozenNorms.NONE) -> "ResNetConfig":
         """The 34-layer network of the paper."""
-        return cls(blocks=(3, 4, 6, 3), channels=(64, 128, 256, 512), bottleneck=False)
+        return cls((3, 4, 6, 3), (64, 128, 256, 512), bottleneck=False, frozen_norms=frozen_norms)
 
     @classmethod
     def resnet50(cls) -> "ResNetConfig":
@@ -162,7 +172,7 @@ class RootConfig:
             self.num_joints in (1, NUM_JOINTS),
             f"`num_joints` must be 1 (the root) or {NUM_JOINTS} (all joints); got {self.num_joints}",
         )
-        _require_counts(self, "stride")
+        require_counts(self, "stride")
 
     @property
     def pooling(self) -> int:
@@ -222,7 +232,7 @@ class BasisConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_points")
+        require_counts(self, "num_points")
         require(
             0 < self.radius < math.inf, f"`radius` must be positive and finite, metres; got {self.radius}"
         )
@@ -304,8 +314,8 @@ class DecoderConfig:
     output: DecoderOutput = DecoderOutput.OFFSETS
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
-        _require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
+        require_counts(self, "num_layers", "ffn_expansion", most=MAX_LAYERS)
+        require_counts(self, "num_heads", "num_neighbours", "cross_attention_basis_stride")
         require(0 <= self.dropout < 1, f"`dropout` must be in [0, 1); got {self.dropout}")
         require(
             self.layer is Design.PAPER or self.num_neighbours <= NUM_QUERIES,
@@ -334,8 +344,8 @@ class JointDecoderConfig:
     """Numbers that a joint takes from the feature maps at its own place."""
 
     def __post_init__(self) -> None:
-        _require_counts(self, "num_layers", "num_blocks", "ffn_expansion", most=MAX_LAYERS)
-        _require_counts(self, "width", "num_heads", "picked_features")
+        require_counts(self, "num_layers", "num_blocks", "ffn_expansion", most=MAX_LAYERS)
+        require_counts(self, "width", "num_heads", "picked_features")
         require(
             self.width % self.num_heads == 0,
             f"`width` must be a multiple of `num_heads` = {self.num_heads}; got {self.width}",
@@ -359,9 +369,61 @@ class CropConfig:
         require(0 < self.ratio < math.inf, f"`ratio` must be positive and finite; got {self.ratio}")
 
 
+class GridDraw(NamedTuple):
+    """Basis points that are drawn anew for every sample from the grids before the cameras."""
+
+    num_points: int
+    """How many are drawn."""
+    points_per_view: int
+    """Grid points of one camera."""
+
+
+class ModelConfig:
+    """What every system's configuration tells the code that runs them all (`network`, `apply`, `infer`, ...).
+
+    The configs are frozen dataclasses that inherit from this class. A property below holds for most systems;
+    one for which it does not overrides it.
+    """
+
+    image_hw: tuple[int, int]
+    image_mean: float
+    image_std: float
+    crop: CropConfig
+
+    @property
+    def query_order(self) -> QueryOrder:
+        """Layout of the 799 query points."""
+        raise NotImplementedError(f"{type(self).__name__} must say its `query_order`")
+
+    @property
+    def triangulates(self) -> bool:
+        """Whether the hand's place comes from rays of two views or more, of heat maps that the system has."""
+        return False
+
+    @property
+    def takes_root(self) -> bool:
+        """Whether `root_world` may be given; it then stands in for the triangulated root."""
+        return False
+
+    @property
+    def grid_draw(self) -> GridDraw | None:
+        """How basis points are drawn from the cameras' grids; None = they are not."""
+        return None
+
+    @property
+    def view_range(self) -> tuple[int, int | None]:
+        """Least and most views that the layers are made for, masked ones counted; None = any number."""
+        return 1, None
+
+    @property
+    def couples_samples(self) -> bool:
+        """Whether a sample's result depends on the other samples of its batch."""
+        return False
+
+
 @dataclass(frozen=True)
-class Config:
-    """A whole model."""
+class Config(ModelConfig):
+    """A whole POEM v2 model."""
 
     image_hw: tuple[int, int] = (256, 256)
     image_mean: float = 0.5
@@ -379,7 +441,7 @@ class Config:
     decoder: DecoderConfig = DecoderConfig()
 
     def __post_init__(self) -> None:
-        _require_counts(self, "image_hw", "width")
+        require_counts(self, "image_hw", "width")
         require(
             isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
             f"`image_hw` must be (height, width); got {self.image_hw}",
@@ -438,3 +500,18 @@ class Config:
             "`joint_decoder` moves the joints that pose the template, by maps of the paper's form: it needs "
             "`decoder.first_queries` = joints and `root.design` = paper",
         )
+
+    @property
+    def query_order(self) -> QueryOrder:
+        """Layout of the 799 query points."""
+        return self.decoder.query_order
+
+    @property
+    def triangulates(self) -> bool:
+        """The root, at least, is triangulated."""
+        return True
+
+    @property
+    def takes_root(self) -> bool:
+        """A known root stands in for the triangulated one."""
+        return True

@@ -20,9 +20,9 @@ from poem_jax.models.vector_attention import (
     VectorAttention,
     nearest_neighbours,
 )
-from poem_jax.typing import Array, Float, PRNGKeyArray
+from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
 
-_PAPER_EPSILON, RELEASE_EPSILON = 1e-5, 1e-12
+PAPER_EPSILON, RELEASE_EPSILON = 1e-5, 1e-12
 """Of the layer norms."""
 
 
@@ -103,7 +103,7 @@ class PaperLayer(nnx.Module):
         self.basis_stride = config.cross_attention_basis_stride
         self.self_attention, self.cross_attention = _scalar_attentions(config, width, rngs)
         self.vector_attention = VectorAttention(width, rngs=rngs)
-        self.norms = nnx.List(layer_norm(width, _PAPER_EPSILON, rngs=rngs) for _ in range(3))
+        self.norms = nnx.List(layer_norm(width, PAPER_EPSILON, rngs=rngs) for _ in range(3))
         moves = _moves(config, is_last)
         self.feed_forward = OffsetNetwork(width, config.ffn_expansion * width, rngs=rngs) if moves else None
 
@@ -255,12 +255,30 @@ class MultiHeadAttention(nnx.Module):
         queries: Float[Array, "batch query c"],
         tokens: Float[Array, "batch token c"],
         dropout_key: PRNGKeyArray | None = None,
+        *,
+        values: Float[Array, "batch token c"] | None = None,
+        token_mask: Bool[Array, "batch token"] | None = None,
     ) -> Float[Array, "batch query c"]:
-        """Let every query read all tokens; in training some of the weights and results are dropped."""
+        """Let every query read all tokens; in training some of the weights and results are dropped.
+
+        Args:
+            queries: who reads.
+            tokens: what the keys are made of, and the values too unless `values` are given.
+            dropout_key: None drops nothing.
+            values: what is read of the tokens.
+            token_mask: True = a token that may be read, None = all. Of a sample without any, what is read
+                means nothing, and is finite where the tokens are.
+        """
         q, k, v = (
             self._heads(layer(x))
-            for layer, x in ((self.query, queries), (self.key, tokens), (self.value, tokens))
+            for layer, x in (
+                (self.query, queries),
+                (self.key, tokens),
+                (self.value, tokens if values is None else values),
+            )
         )
+        # One row a head, as in `_heads`.
+        mask = None if token_mask is None else jnp.repeat(token_mask, self.num_heads, 0)
         if dropout_key is None:
             keys, out_key = None, None
         else:
@@ -269,7 +287,7 @@ class MultiHeadAttention(nnx.Module):
         attend = functools.partial(_attend, dropout_rate=self.dropout_rate)
         # One head of one sample at a time, recomputed in the backward pass: no array is larger than its map,
         # and each product is one plain matrix product, several times faster on a CPU than with heads inside.
-        read = jax.lax.map(jax.checkpoint(attend), (q, k, v, keys))  # pyright: ignore[reportPrivateImportUsage]
+        read = jax.lax.map(jax.checkpoint(attend), (q, k, v, keys, mask))  # pyright: ignore[reportPrivateImportUsage]
         return dropout(self.out(self._joined(read, len(queries))), self.dropout_rate, out_key)
 
     def _heads(self, x: Float[Array, "batch token c"]) -> Float[Array, "batch_head token c2"]:
@@ -284,11 +302,14 @@ class MultiHeadAttention(nnx.Module):
 
 
 def _attend(
-    arguments: tuple[Array, Array, Array, PRNGKeyArray | None], *, dropout_rate: float
+    arguments: tuple[Array, Array, Array, PRNGKeyArray | None, Array | None], *, dropout_rate: float
 ) -> Float[Array, "query c"]:
     """Let the queries of one head read its tokens."""
-    q, k, v, key = arguments
+    q, k, v, key, mask = arguments
     logits = (q * q.shape[-1] ** -0.5) @ k.T
+    if mask is not None:
+        # Not minus infinity, of which a row without any valid token would make NaN.
+        logits = jnp.where(mask, logits, jnp.finfo(logits.dtype).min)
     weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, -1, keepdims=True)))
     total = jnp.sum(weights, -1, keepdims=True)
     # Divided last: the map is passed over once less.

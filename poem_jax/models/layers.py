@@ -64,6 +64,23 @@ class MaskedBatchNorm(nnx.Module):
         self.variance[...] += jax.lax.stop_gradient(share * (unbiased - self.variance[...]))
 
 
+class FrozenBatchNorm(nnx.Module):
+    """Batch norm that stays as the trunk was pre-trained: its scale and bias are constants among the
+    statistics, and training neither uses nor moves moments."""
+
+    def __init__(self, channels: int) -> None:
+        self.scale, self.bias = nnx.BatchStat(filled(1.0, channels)), nnx.BatchStat(filled(0.0, channels))
+        self.mean, self.variance = nnx.BatchStat(filled(0.0, channels)), nnx.BatchStat(filled(1.0, channels))
+
+    def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h w c"]:
+        """Normalise by the running statistics, whatever the mode."""
+        scale, bias, mean, variance = (
+            jax.lax.stop_gradient(leaf[...]) for leaf in (self.scale, self.bias, self.mean, self.variance)
+        )
+        gain = scale * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)
+        return x * gain + (bias - mean * gain)
+
+
 def masked_moments(
     x: Float[Array, "image h w c"], image_mask: Bool[Array, " image"], axis_name: str | None = None
 ) -> tuple[Float[Array, " c"], Float[Array, " c"], Float[Array, ""]]:
@@ -124,10 +141,12 @@ class ConvNorm(nnx.Module):
         *,
         bias: bool = False,
         relu: bool = True,
+        frozen: bool = False,
         rngs: nnx.Rngs,
     ) -> None:
+        """`frozen`: the batch norm is never trained."""
         self.conv = Conv(c_in, c_out, size, stride, bias=bias, rngs=rngs)
-        self.norm = MaskedBatchNorm(c_out)
+        self.norm = (FrozenBatchNorm if frozen else MaskedBatchNorm)(c_out)
         self.relu = relu
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h2 w2 c2"]:
@@ -227,6 +246,13 @@ def normal(key: PRNGKeyArray, shape: tuple[int, ...], scale: float = 1.0) -> Flo
     if isinstance(key, Tracer):
         return scale * jax.random.normal(key, shape, jnp.float32)
     return jnp.asarray(scale * _numpy_generator(key).standard_normal(shape, np.float32))
+
+
+def uniform(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:
+    """Draw evenly from [0, 1)."""
+    if isinstance(key, Tracer):
+        return jax.random.uniform(key, shape, jnp.float32)
+    return jnp.asarray(_numpy_generator(key).random(shape, np.float32))
 
 
 def he_normal(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:

@@ -132,11 +132,15 @@ def sine_code(uv_share: Float[Array, "*batch 2"], width: int) -> Float[Array, "*
 
     y comes before x; sine and cosine of a frequency are interleaved.
     """
-    half = width // 2
-    frequency = 2 * np.pi * _TEMPERATURE ** (-2.0 * np.arange(half // 2) / half)
-    angle = uv_share[..., ::-1, None] * jnp.asarray(frequency, uv_share.dtype)
+    return interleaved_code(uv_share[..., ::-1], width // 2)
+
+
+def interleaved_code(shares: Float[Array, "*batch axis"], width: int) -> Float[Array, "*batch c"]:
+    """Encode every axis by `width` numbers: sine and cosine of 2 pi x / 10000^(2 i / width), interleaved."""
+    frequency = 2 * np.pi * _TEMPERATURE ** (-2.0 * np.arange(width // 2) / width)
+    angle = shares[..., None] * jnp.asarray(frequency, shares.dtype)
     code = jnp.stack([jnp.sin(angle), jnp.cos(angle)], -1)
-    return code.reshape(*uv_share.shape[:-1], width)
+    return code.reshape(*shares.shape[:-1], shares.shape[-1] * width)
 
 
 class ViewRowColumnCode(nnx.Module):

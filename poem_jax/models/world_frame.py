@@ -42,13 +42,13 @@ class WorkingFrame(NamedTuple):
 
 
 class Reconstruction(NamedTuple):
-    """What the network found, in the primary camera's frame, metres."""
+    """What the network found, in the primary camera's frame, metres; None = the system has no such thing."""
 
-    keypoints_px: Float[Array, "batch view joint 2"]
-    heat_maps: Float[Array, "batch view joint h w"]
-    reference_joints: Float[Array, "batch joint 3"]
+    keypoints_px: Float[Array, "batch view joint 2"] | None
+    heat_maps: Float[Array, "batch view joint h w"] | None
+    reference_joints: Float[Array, "batch joint 3"] | None
     """Triangulated key points; zero where they could not be."""
-    root: Float[Array, "batch 3"]
+    root: Float[Array, "batch 3"] | None
     valid: Bool[Array, " batch"]
     layers: Float[Array, "batch layer query 3"]
     """Query points after every layer, in the order of the config."""
@@ -108,16 +108,17 @@ def leave_working_frame(
     """Express what the network found in the user's world."""
     layers_world = _to_world(frame, found.layers)
     vertices_world, joints_world = split_queries(layers_world[:, -1], order)
-    has_all_joints = found.reference_joints.shape[1] == NUM_JOINTS
+    reference, root = found.reference_joints, found.root
+    has_all_joints = reference is not None and reference.shape[1] == NUM_JOINTS
     prediction = Prediction(
         vertices_world=vertices_world,
         joints_world=joints_world,
-        root_world=_to_world(frame, found.root[:, None])[:, 0],
+        root_world=None if root is None else _to_world(frame, root[:, None])[:, 0],
         keypoints_px=found.keypoints_px,
         heat_maps=found.heat_maps,
         layers_world=layers_world,
         valid=found.valid & frame.complete,
-        reference_joints_world=_to_world(frame, found.reference_joints) if has_all_joints else None,
+        reference_joints_world=_to_world(frame, reference) if has_all_joints else None,
     )
     if found.parameters is None:
         return prediction

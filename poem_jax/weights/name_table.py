@@ -41,6 +41,9 @@ class NameRow(NamedTuple):
     axes: Axes = Axes.SAME
     index: tuple[int, ...] = ()
     """Place along the leading axes of an array that stacks the weights of equal blocks."""
+    part: tuple[int, int] = (0, 1)
+    """(i, n): the row takes the i-th of n equal parts of the foreign array, along its first axis. The rows of
+    one source follow each other in the order of their parts."""
 
 
 NameRows = Iterator[NameRow]
@@ -51,6 +54,16 @@ def linear(source: str, path: str, *, bias: bool = True) -> NameRows:
     yield NameRow(f"{source}.weight", f"trainable.{path}.kernel", Axes.TRANSPOSED)
     if bias:
         yield NameRow(f"{source}.bias", f"trainable.{path}.bias")
+
+
+def attention(source: str, path: str) -> NameRows:
+    """List PyTorch's `MultiheadAttention`, which stacks the weights of queries, keys and values."""
+    for i, part in enumerate(("query", "key", "value")):
+        yield NameRow(
+            f"{source}.in_proj_weight", f"trainable.{path}.{part}.kernel", Axes.TRANSPOSED, part=(i, 3)
+        )
+        yield NameRow(f"{source}.in_proj_bias", f"trainable.{path}.{part}.bias", part=(i, 3))
+    yield from linear(f"{source}.out_proj", f"{path}.out")
 
 
 def layer_norm(source: str, path: str) -> NameRows:
@@ -66,20 +79,27 @@ def convolution(source: str, path: str, index: tuple[int, ...] = (), *, bias: bo
         yield NameRow(f"{source}.bias", f"trainable.{path}.bias", index=index)
 
 
-def batch_norm(source: str, path: str, index: tuple[int, ...] = ()) -> NameRows:
-    """List a batch norm."""
-    for name, ours in (("weight", "trainable.{}.scale"), ("bias", "trainable.{}.bias")):
-        yield NameRow(f"{source}.{name}", ours.format(path), index=index)
+def batch_norm(source: str, path: str, index: tuple[int, ...] = (), *, frozen: bool = False) -> NameRows:
+    """List a batch norm; all of a frozen one is among the statistics."""
+    group = "statistics" if frozen else "trainable"
+    for name, ours in (("weight", "scale"), ("bias", "bias")):
+        yield NameRow(f"{source}.{name}", f"{group}.{path}.{ours}", index=index)
     for name, ours in (("running_mean", "statistics.{}.mean"), ("running_var", "statistics.{}.variance")):
         yield NameRow(f"{source}.{name}", ours.format(path), index=index)
 
 
 def conv_norm(
-    conv: str, norm: str, path: str, index: tuple[int, ...] = (), *, bias: bool = False
+    conv: str,
+    norm: str,
+    path: str,
+    index: tuple[int, ...] = (),
+    *,
+    bias: bool = False,
+    frozen: bool = False,
 ) -> NameRows:
     """List a convolution and the batch norm that follows it."""
     yield from convolution(conv, f"{path}.conv", index, bias=bias)
-    yield from batch_norm(norm, f"{path}.norm", index)
+    yield from batch_norm(norm, f"{path}.norm", index, frozen=frozen)
 
 
 def read_rows(
@@ -102,22 +122,25 @@ def read_rows(
         if row.source not in state:
             problems.append(f"{row.source}: missing, expected for {row.path}")
             continue
-        array = state[row.source]
-        if not _is_real(array) or len(expected) != array.ndim or row.axes.to_ours(array).shape != expected:
+        array, wanted = state[row.source], _foreign_shape(row, expected)
+        if not _is_real(array) or array.shape != wanted:
             found = f"{array.dtype} of shape {array.shape}"
-            wanted = _foreign_shape(row, expected)
             problems.append(f"{row.source}: expected floats of shape {wanted} for {row.path}, got {found}")
             continue
         target = leaves.setdefault(row.path, np.empty(leaf.shape, leaf.dtype))
-        target[row.index] = row.axes.to_ours(array)
+        target[row.index] = row.axes.to_ours(_taken(array, row.part))
     return leaves, problems
 
 
 def write_rows(rows: list[NameRow], leaves: dict[str, Array]) -> dict[str, np.ndarray]:
     """Undo `read_rows`: return the foreign arrays by name, contiguous."""
+    parts: dict[str, list[np.ndarray]] = {}
+    for row in rows:
+        array = row.axes.to_foreign(np.asarray(leaves[row.path])[row.index])
+        parts.setdefault(row.source, []).append(array)
     return {
-        row.source: np.ascontiguousarray(row.axes.to_foreign(np.asarray(leaves[row.path])[row.index]))
-        for row in rows
+        source: np.ascontiguousarray(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
+        for source, arrays in parts.items()
     }
 
 
@@ -126,5 +149,13 @@ def _is_real(array: np.ndarray) -> bool:
     return array.dtype.kind == "f" or array.dtype.name == "bfloat16"
 
 
+def _taken(array: np.ndarray, part: tuple[int, int]) -> np.ndarray:
+    i, count = part
+    return array if count == 1 else np.split(array, count)[i]
+
+
 def _foreign_shape(row: NameRow, ours: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(int(n) for n in row.axes.to_foreign(np.empty(ours, np.bool_)).shape)
+    """Return the shape of the whole foreign array of which the row takes a part of shape `ours`."""
+    shape = tuple(int(n) for n in row.axes.to_foreign(np.empty(ours, np.bool_)).shape)
+    _, count = row.part
+    return shape if count == 1 else (count * shape[0], *shape[1:])

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from poem_jax.models.config import HRNetConfig, ResNetConfig, Stem
+from poem_jax.models.config import FrozenNorms, HRNetConfig, ResNetConfig, Stem
 from poem_jax.weights.name_table import NameRows, conv_norm
 
 _BASIC = ((1, "first"), (2, "second"))
@@ -70,19 +70,27 @@ def resnet_rows(config: ResNetConfig, prefix: str = "") -> NameRows:
     """List a ResNet under torchvision's names."""
     if config.stem is not Stem.CONVOLUTION:
         raise ValueError(f"a ResNet with the stem {config.stem.value!r} has no counterpart in torchvision")
-    yield from conv_norm(f"{prefix}conv1", f"{prefix}bn1", "trunk.stem.conv")
+    frozen = config.frozen_norms is FrozenNorms.STAGE_STARTS
+    yield from conv_norm(f"{prefix}conv1", f"{prefix}bn1", "trunk.stem.conv", frozen=frozen)
     parts = _BOTTLENECK if config.bottleneck else _BASIC
     widths = (config.stem_channels, *config.channels)
     for stage, count in enumerate(config.blocks):
         for block in range(count):
             source, path = f"{prefix}layer{stage + 1}.{block}", f"trunk.stages.{stage}.blocks.{block}"
-            yield from _block(source, path, parts)
+            yield from _block(source, path, parts, frozen=frozen and block == 0)
             if block == 0 and (stage > 0 or widths[0] != widths[1]):
-                yield from conv_norm(f"{source}.downsample.0", f"{source}.downsample.1", f"{path}.shortcut")
+                names = f"{source}.downsample.0", f"{source}.downsample.1"
+                yield from conv_norm(*names, f"{path}.shortcut", frozen=frozen)
 
 
 def _block(
-    source: str, path: str, parts: tuple[tuple[int, str], ...], index: tuple[int, ...] = ()
+    source: str,
+    path: str,
+    parts: tuple[tuple[int, str], ...],
+    index: tuple[int, ...] = (),
+    *,
+    frozen: bool = False,
 ) -> NameRows:
     for number, part in parts:
-        yield from conv_norm(f"{source}.conv{number}", f"{source}.bn{number}", f"{path}.{part}", index)
+        names = f"{source}.conv{number}", f"{source}.bn{number}"
+        yield from conv_norm(*names, f"{path}.{part}", index, frozen=frozen)
