@@ -3,6 +3,7 @@
 import jax
 import pytest
 
+from poem_jax.models.config import Config
 from poem_jax.models.network import describe
 from poem_jax.models.presets import PRESETS, preset
 
@@ -31,10 +32,12 @@ def test_tiny_fits_into_the_package():
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_groups_and_layout(name):
-    params = describe(preset(name))
+    config = preset(name)
+    params = describe(config)
     assert set(params) == {"trainable", "statistics", "constants"}
-    assert params["constants"]["basis_points"].shape == (preset(name).basis.num_points, 3)
-    assert params["constants"]["template_queries"].shape == (799, 3)
+    if isinstance(config, Config):
+        assert params["constants"]["basis_points"].shape == (config.basis.num_points, 3)
+        assert params["constants"]["template_queries"].shape == (799, 3)
     assert params["constants"]["hand"]["faces"].shape == (1538, 3)
     for path, _ in jax.tree_util.tree_leaves_with_path(params):
         assert all(isinstance(part, jax.tree_util.DictKey) and isinstance(part.key, str) for part in path)
