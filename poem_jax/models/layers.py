@@ -16,7 +16,8 @@ import numpy as np
 from flax import nnx
 from jax.core import Tracer
 
-from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
+from poem_jax.models.config import ModelConfig
+from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
 
 BATCH_NORM_EPSILON = 1e-5
 BATCH_NORM_MOMENTUM = 0.1
@@ -35,6 +36,16 @@ class NormMode(NamedTuple):
     def training(self) -> bool:
         """Whether the moments of the images at hand are used."""
         return self.image_mask is not None
+
+
+def trunk_images(
+    views: Num[Array, "*batch h w 3"], config: ModelConfig, dtype: Any
+) -> Float[Array, "image h w 3"]:
+    """Return views, uint8 or float in [0, 1], as the trunk of a model takes them: in one row, about the
+    config's mean and over its standard deviation."""
+    scale = 255.0 if views.dtype == jnp.uint8 else 1.0
+    images = jnp.asarray(views.reshape(-1, *views.shape[-3:]), dtype) / scale
+    return (images - config.image_mean) / config.image_std
 
 
 class MaskedBatchNorm(nnx.Module):

@@ -156,6 +156,9 @@ def forward(
         axis_name: device axis over which the moments are averaged.
 
     Returns: the prediction, and the new `params["statistics"]` (unchanged unless `train`).
+
+    Raises:
+        ValueError: a padded number of views that the system cannot take.
     """
     frame = enter_working_frame(views, cams, root_world, number_type(params))
     model = assemble(config, params)
@@ -178,10 +181,22 @@ def reconstruct(
 ) -> Prediction:
     """Reconstruct one hand per sample in the user's world, from within the working frame; `frozen_views` as
     in `forward`."""
+    check_view_count(model.config, views.shape[1])
     shown = jnp.where(frame.cams.view_mask[..., None, None, None], views, 0)
     seen = model.look(shown, NormMode() if frozen_views else mode)
     seen = jax.lax.stop_gradient(seen) if frozen_views else seen
     return model.find_hands(seen, frame, mode, dropout_key=dropout_key, **draw.arguments())
+
+
+def check_view_count(config: ModelConfig, num_views: int, name: str = "`views`") -> None:
+    """Raise `ValueError` for a padded number of views that a system cannot take; `name` is what has them."""
+    least, most = config.view_range
+    if num_views < least or (most is not None and num_views > most):
+        wanted = f"{least}" if least == most else f"{least} to {most}"
+        raise ValueError(
+            f"{name} must have {wanted} views, as the layers of this {type(config).__name__} are made for; "
+            f"got {num_views}. Leave views out, pad with masked ones, or take a model for {num_views}"
+        )
 
 
 def number_type(params: Params) -> Any:

@@ -23,7 +23,7 @@ from poem_jax.models.decoder import Decoder, Surroundings
 from poem_jax.models.hand_output import ParameterRegressor, first_queries, root_relative_mesh
 from poem_jax.models.heat_maps import FALLBACK_ROOT, HeatMapBranch, root_point, triangulate_joints
 from poem_jax.models.joint_decoder import JointDecoder
-from poem_jax.models.layers import NormMode
+from poem_jax.models.layers import NormMode, trunk_images
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.point_features import (
     FeatureBranch,
@@ -96,7 +96,7 @@ class Poem(nnx.Module):
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
         """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
-        levels = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
+        levels = self.trunk(trunk_images(views, self.config, self.basis_points[...].dtype), mode)
         keypoints_px, heat_maps = self.heat_maps(levels, mode)
         said = None if self.joint_decoder is None else jnp.moveaxis(evidence(heat_maps), -1, -3)
         seen = ViewFeatures(keypoints_px, heat_maps, self.features(levels, heat_maps, mode), said)
@@ -160,11 +160,6 @@ class Poem(nnx.Module):
             return first
         start = self.template_queries[...] / self.config.basis.radius
         return self.decoder.layers[0].with_deltas(start[None], first)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.basis_points[...].dtype) / scale
-        return (images - self.config.image_mean) / self.config.image_std
 
     def _read_views(
         self, feature_maps: Float[Array, "batch view h w c"], cams: Cameras, root: Float[Array, "batch 3"]

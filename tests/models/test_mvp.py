@@ -134,7 +134,7 @@ def test_every_view_matters(config, make_scene):
 
 @pytest.mark.parametrize("count", [VIEWS - 1, VIEWS + 1])
 def test_another_number_of_views_is_refused(config, make_scene, count):
-    with pytest.raises(ValueError, match=rf"takes {VIEWS} views.*got {count}.*view_mask"):
+    with pytest.raises(ValueError, match=rf"must have {VIEWS} views.*got {count}.*pad with masked"):
         run(config, *make_scene(2, count))
 
 
