@@ -7,6 +7,7 @@ Weights are drawn by NumPy, seeded by the JAX key: compiling JAX's generators fo
 takes a minute. Under a trace JAX draws them: other numbers of the same distribution.
 """
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -207,9 +208,15 @@ def repeat_pixels(x: Float[Array, "image h w c"], factor: int) -> Float[Array, "
 
 
 def max_pool(x: Float[Array, "image h w c"], factor: int) -> Float[Array, "image h2 w2 c"]:
-    """Reduce to the largest of every `factor` x `factor` pixels."""
+    """Reduce to the largest of every `factor` x `factor` pixels.
+
+    Two by two: the gradient of one maximum of many looks for the number that equals it, and where a compiler
+    computes that number twice, rounded differently, none does and the gradient is 0 / 0.
+    """
     image, h, w, c = x.shape
-    return jnp.max(x.reshape(image, h // factor, factor, w // factor, factor, c), (2, 4))
+    cells = x.reshape(image, h // factor, factor, w // factor, factor, c)
+    rows = functools.reduce(jnp.maximum, (cells[:, :, i] for i in range(factor)))
+    return functools.reduce(jnp.maximum, (rows[..., i, :] for i in range(factor)))
 
 
 def double_bilinear(x: Float[Array, "image h w c"]) -> Float[Array, "image h2 w2 c"]:
