@@ -20,6 +20,7 @@ from poem_jax.models.config import (
     FeatureConfig,
     FirstQueries,
     HeatActivation,
+    JointDecoderConfig,
     ResNetConfig,
     RootConfig,
     Similarity,
@@ -65,6 +66,7 @@ TINY = Config(
     features=FeatureConfig(stride=4, heat_maps=True),
     basis=BasisConfig(num_points=1024),
     aggregation=AggregationConfig(similarity=Similarity.EQUAL),
+    joint_decoder=JointDecoderConfig(),
     decoder=DecoderConfig(
         num_layers=2,
         num_neighbours=8,
