@@ -38,7 +38,8 @@ class Prediction(NamedTuple):
     keypoints_px: Float[Array, "batch view joint 2"]
     """Heat-map coordinates per view; one joint (the root) in the paper, 21 in the release."""
     layers_world: Float[Array, "batch layer 799 3"]
-    """Query points after every decoder layer, in the preset's own query order."""
+    """Query points after every layer that moves them, those of a joint decoder first, in the preset's own
+    query order."""
     valid: Bool[Array, " batch"]
     """False where the sample could not be solved (no valid view, or one view and no root)."""
     heat_maps: Float[Array, "batch view joint h w"] | None = None

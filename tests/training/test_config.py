@@ -175,3 +175,12 @@ def test_differences_name_the_field_and_leave_bookkeeping_out(micro_config):
 def test_configs_hash_and_compare(micro_config):
     assert isinstance(micro_config, TrainConfig)
     assert hash(micro_config) == hash(replace(micro_config))
+
+
+def test_runs_of_earlier_versions_go_on():
+    """Fields that they do not name had no other value then."""
+    now = flatten_config(open_experiment("v2_nano_synthetic"))
+    then = {key: value for key, value in now.items() if key not in ("frozen_views", "model.joint_decoder")}
+    assert len(then) == len(now) - 2
+    assert differences(then, now) == []
+    assert differences(then, {**now, "frozen_views": True}) == ["frozen_views: False -> True"]
