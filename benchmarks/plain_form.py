@@ -94,9 +94,13 @@ def plain_forward(
     centre = _root(joints, solved, root)
 
     tokens = plain_sampling_and_aggregation(params, maps, cams, centre, config)
-    start = plain_start(params, joints - centre[:, None], solved, config)
+    places = [joints - centre[:, None]]
+    if config.joint_decoder is not None:
+        places += plain_joint_decoder(params, places[0], heat_maps, maps, cams, centre, config)
+    starts = [plain_start(params, at, solved, config) for at in places]
+    start = starts[-1]
     moved, embeddings, found = plain_decoder(params, start, tokens, config, neighbours)
-    layers = [config.basis.radius * queries for queries in moved]
+    layers = [config.basis.radius * queries for queries in starts[1:] + moved]
     if config.decoder.output is DecoderOutput.HAND_PARAMETERS:
         layers.append(plain_hand(params, embeddings, config))
     to_world = invert_rigid(T_primary_from_world)
@@ -405,6 +409,73 @@ def plain_start(
         there = join_queries(vertices, joints, order)
         posed = jnp.where(jnp.all(solved, -1)[:, None, None], there, posed)
     return posed / config.basis.radius
+
+
+# The joint decoder.
+
+
+def plain_joint_decoder(
+    params: Params,
+    joints: Float[Array, "batch 21 3"],
+    heat_maps: Float[Array, "batch view 21 h w"],
+    maps: Float[Array, "batch view h w c"],
+    cams: Cameras,
+    centre: Float[Array, "batch 3"],
+    config: Config,
+) -> list[Float[Array, "batch 21 3"]]:
+    """Return the joints after every layer; they, and what is returned, in metres about `centre`."""
+    assert config.joint_decoder is not None
+    length = jnp.maximum(jnp.linalg.norm(joints, axis=-1, keepdims=True), 1e-6)
+    joints = joints * jnp.minimum(1.0, 1.5 * config.basis.radius / length)
+    evidence = 0.25 * jnp.log(heat_maps.shape[-2] * heat_maps.shape[-1] * heat_maps + 0.01)
+    around = [jnp.zeros((1, 3))]
+    for i, radius in enumerate(config.joint_decoder.shells_m):
+        corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / jnp.sqrt(3.0)
+        around.append(radius * (corners if i % 2 else jnp.concatenate([jnp.eye(3), -jnp.eye(3)])))
+    cloud = jnp.concatenate(around)
+    places = []
+    for w in _rows(_weights(params)["joint_decoder"]["layers"]):
+        R = _hand_axes(joints)
+        clouds = joints[:, :, None] + jnp.einsum("px,bxy->bpy", cloud, R)[:, None]
+        said = jnp.mean(_read(evidence[..., None], clouds + centre[:, None, None], cams, config), 1)[..., 0]
+        joint_maps = jnp.broadcast_to(maps[:, :, None], (*maps.shape[:2], 21, *maps.shape[2:]))
+        seen = jnp.mean(_read(joint_maps, (joints + centre[:, None])[:, :, None], cams, config), 1)[:, :, 0]
+        local = jnp.einsum("bxy,bjy->bjx", R, joints - joints[:, ROOT_JOINT, None]) / config.basis.radius
+        tokens = jnp.concatenate([local, said, _linear(seen, w["pick"])], -1)
+        x = jnp.einsum("bjn,jnc->bjc", tokens, w["embed"]) + w["names"]
+        for block in _rows(w["blocks"]):
+            y = _layer_norm(x, block["before_attention"], 1e-5)
+            x = x + _attention(y, y, block["attention"], config.joint_decoder.num_heads)
+            y = _linear(_layer_norm(x, block["before_hidden"], 1e-5), block["hidden"])
+            x = x + _linear(jax.nn.gelu(y), block["out"])
+        step = 0.01 * _linear(_layer_norm(x, w["norm"], 1e-5), w["offset"])
+        joints = joints + jnp.einsum("bjx,bxy->bjy", step, R)
+        places.append(joints)
+    return places
+
+
+def _hand_axes(joints: Float[Array, "batch 21 3"]) -> Float[Array, "batch 3 3"]:
+    """Return rows: from the wrist to the knuckles' middle, across them, and the palm's normal."""
+    knuckles = joints[:, [5, 9, 13, 17]]
+    along = jnp.mean(knuckles, 1) - joints[:, 0]
+    along = along / jnp.linalg.norm(along, axis=-1, keepdims=True)
+    across = jnp.einsum("k,bkx->bx", jnp.array([1.0, 0.5, -0.5, -1.0]), knuckles)
+    across = across - jnp.sum(across * along, -1, keepdims=True) * along
+    across = across / jnp.linalg.norm(across, axis=-1, keepdims=True)
+    return jnp.stack([along, across, jnp.cross(along, across)], 1)
+
+
+def _read(
+    maps: Float[Array, "batch view joint h w c"],
+    points: Float[Array, "batch joint point 3"],
+    cams: Cameras,
+    config: Config,
+) -> Float[Array, "batch view joint point c"]:
+    """Sample the map of every joint where its points project; behind a camera there are zeros."""
+    K, T = (x[:, :, None] for x in (cams.K, cams.T_cam_from_world))
+    uv, depth = project(K, T, points[:, None])
+    cells = uv / jnp.array(config.image_hw[::-1]) * jnp.array(maps.shape[-3:-1][::-1])
+    return jnp.where((depth > 0)[..., None], sample_bilinear(maps, cells), 0)
 
 
 # The decoder.

@@ -42,7 +42,8 @@ class Prediction(NamedTuple):
     keypoints_px: Float[Array, "batch view joint 2"] | None
     """Heat-map coordinates per view; one joint (the root) in POEM v2's paper, else 21."""
     layers_world: Float[Array, "batch layer 799 3"]
-    """Query points after every decoder layer, in the preset's own query order."""
+    """Query points after every layer that moves them, those of a joint decoder first, in the preset's own
+    query order."""
     valid: Bool[Array, " batch"]
     """False where the sample could not be solved (no valid view; one view and no root, where the system
     triangulates; no basis point near the hand)."""

@@ -35,7 +35,7 @@ class Penalty(Enum):
 
 
 class Layers(Enum):
-    """Which decoder layers are supervised; the terms of several layers are summed."""
+    """Which layers of `Prediction.layers_world` are supervised; the terms of several layers are summed."""
 
     LAST = "last"
     EVERY = "every"

@@ -1,8 +1,9 @@
 """Which stage of a POEM v2 model does the work: its errors with a part replaced by the truth, or by nothing.
 
 The first stage looks at every view alone (`Poem.look`), the second joins the views (`Poem.find_hands`).
-Between the two, feature maps, key points and root can be replaced, and nothing else. A second stage that
-reads the images does worse without its features on the very same captures; one that is dead does not notice.
+Between the two, what the second stage reads of the images, key points and root can be replaced, and nothing
+else. A second stage that reads does worse without it on the very same captures; one that is dead does not
+notice.
 """
 
 import functools
@@ -48,13 +49,13 @@ class StageErrors(NamedTuple):
     layers: Float[np.ndarray, "sample layer"]
     """After every layer; the last is the model's answer."""
     zero: Float[np.ndarray, " sample"]
-    """With feature maps of zeros."""
+    """With zeros for all that the second stage reads of the images: feature maps, evidence of the joints."""
     another: Float[np.ndarray, " sample"]
-    """With the feature maps of another capture of the batch."""
+    """With those of another capture of the batch."""
     true_root: Float[np.ndarray, " sample"]
     """With the true root."""
     true_joints: Float[np.ndarray, " sample"]
-    """With the true key points in place of the heat maps' expectations."""
+    """With the true key points in place of the heat maps' expectations; what the second stage reads stays."""
     keypoint_share: Float[np.ndarray, " sample"]
     """Error of the key points in the images over the hand's extent there."""
     hidden_share: Float[np.ndarray, " sample"]
@@ -91,7 +92,7 @@ def stage_errors(
         captures: where the samples come from; their first `num_views` views are used.
         samples: how many; a multiple of `batch_size`.
         num_views: at least 2, so that the first stage finds the root.
-        batch_size: captures at a time, at least 2; one gets the feature maps of the one before it.
+        batch_size: captures at a time, at least 2; one reads what belongs to the one before it.
 
     Raises:
         ValueError: a model that is not of POEM v2, counts other than these, or captures with masked views.
@@ -162,10 +163,10 @@ def format_stages(by_views: dict[int, StageErrors]) -> str:
 _LEGEND = """posed        the template posed by the triangulated joints: the first stage alone
 layer n      after each layer of the second stage; the last is the model's answer (of a parametric model,
              the mesh of its parameters)
-zero         with feature maps of zeros in the second stage, which never occur in training
-another      with the feature maps of another capture
+zero         with zeros for all that the second stage reads of the images, which never occur in training
+another      with what another capture gives it to read
 true root    with the true root joint
-true joints  with the true key points in every view
+true joints  with the true key points triangulated; what the second stage reads stays
 2D %         error of the key points over the hand's extent in the image
 hidden %     part of that error that comes from joints which the view does not show"""
 

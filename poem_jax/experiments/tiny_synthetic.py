@@ -4,8 +4,8 @@ What:      1 to 8 views of 128 x 128, a kind of batch drawn anew every step. The
            heat maps alone; then all is trained, the second stage about the first one's own root. Absolute
            losses on every layer; averaged weights are evaluated and shipped.
 Hardware:  a GPU beside many CPU cores that draw the captures; the same command uses what it finds.
-Time:      two days on 2 CPU cores, by its rate there; not run to its end. The shipped weights come from three
-           sittings with a GPU, 15 minutes in all, by a script around the same step (docs/training.md).
+Time:      two days on 2 CPU cores, by its rate there; not run to its end. The shipped weights come from five
+           sittings by scripts around the same modules (docs/training.md).
 Expected:  see docs/training.md (poem eval tiny_synthetic --stages).
 Command:   poem train tiny_synthetic
 Then:      poem train tiny_synthetic --export poem_jax/weights/tiny

@@ -79,6 +79,7 @@ class HRNetConfig:
     def __post_init__(self) -> None:
         require_counts(self, "width", "stem_channels")
         require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
+        # The first widens the map, the others are one stack of equals.
         require(self.stem_blocks >= 2, f"`stem_blocks` must be at least 2; got {self.stem_blocks}")
         require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 

@@ -94,15 +94,15 @@ def first_queries(
 ) -> Float[Array, "batch 799 3"]:
     """Return the template posed by the joints, metres about the root; the template where they are not
     `solved`. Joints farther than 1.5 basis radii from the root are drawn in."""
-    joints = _draw_in(joints, _MAX_JOINT_DISTANCE * radius)
+    joints = draw_in(joints, radius)
     posed = pose_by_joints(hand, *split_queries(template, order), joints)
     return jnp.where(solved[:, None, None], join_queries(posed, joints, order), template)
 
 
-def _draw_in(points: Float[Array, "*batch 3"], limit: float) -> Float[Array, "*batch 3"]:
-    """Shorten vectors to at most `limit`."""
-    square = jnp.sum(points**2, -1, keepdims=True)
-    return points * jnp.minimum(1.0, limit * jax.lax.rsqrt(jnp.maximum(square, 1e-12)))
+def draw_in(joints: Float[Array, "*batch 3"], radius: float) -> Float[Array, "*batch 3"]:
+    """Bring joints about the root that are farther from it than 1.5 basis radii to that distance."""
+    square = jnp.sum(joints**2, -1, keepdims=True)
+    return joints * jnp.minimum(1.0, _MAX_JOINT_DISTANCE * radius * jax.lax.rsqrt(jnp.maximum(square, 1e-12)))
 
 
 class HandParameters(NamedTuple):

@@ -5,8 +5,8 @@ the view does not know. Here every joint carries a small cloud of basis points, 
 frame; each point is given what the views' heat maps say of that joint there, the joints read each other, and
 move. After every layer the clouds stand at the new places and read the maps again.
 
-The hand's frame is spanned by palm and knuckles. Written in it, a layer is the same for every orientation of
-hand and cameras and need not learn them.
+The hand's frame is spanned by palm and knuckles (rows: along the palm, across it, its normal). Written in it,
+places and offsets do not depend on how hand and cameras stand in the world, nor on which camera is primary.
 """
 
 import jax
@@ -38,7 +38,14 @@ class JointDecoder(nnx.Module):
     """A row of layers that each move the 21 joints."""
 
     def __init__(self, config: JointDecoderConfig, map_width: int, radius: float, *, rngs: nnx.Rngs) -> None:
-        """`map_width`: channels of the feature maps; `radius`: unit of coordinates, metres."""
+        """Make the layers.
+
+        Args:
+            config: their sizes.
+            map_width: channels of the feature maps.
+            radius: metres; the joints' places about the root joint are told in this unit.
+            rngs: where the weights are drawn from.
+        """
         self.radius = radius
         self.layers = nnx.List(JointLayer(config, map_width, rngs=rngs) for _ in range(config.num_layers))
 
@@ -56,11 +63,12 @@ class JointDecoder(nnx.Module):
 
         Args:
             joints: where they start.
-            evidence: what each view says of each joint: the logarithm of its heat over an even map's.
+            evidence: what each view says of each joint, from `point_features.evidence`.
             feature_maps: of the same views.
             cams: cameras of these views; masked ones say nothing.
             image_hw: size of the images.
-            training: a layer learns from its own step, not from the places that the layers before it gave.
+            training: no gradient goes from a layer to those before it. What comes after the last layer may
+                send it one.
         """
         moved = []
         for layer in self.layers:
@@ -119,8 +127,10 @@ class Block(nnx.Module):
 
 
 def cloud(shells_m: tuple[float, ...]) -> Float[np.ndarray, "point 3"]:
-    """Return the basis points of one joint in the hand's frame, metres about it: its own place, and shells of
-    six points along the axes and of eight between them in turn."""
+    """Return the basis points of one joint, metres about it along the axes of the hand's frame.
+
+    The joint's own place, and shells of six points along the axes and of eight between them in turn.
+    """
     shells = [radius * (_CORNERS if i % 2 else _AXES) for i, radius in enumerate(shells_m)]
     return np.concatenate([np.zeros((1, 3)), *shells]).astype(np.float32)
 
@@ -134,7 +144,8 @@ def read_evidence(
     """Return what the views say, on average, of each joint at the points of its cloud.
 
     The mean over views of logarithms of probabilities: of the places that the views could mean, the one that
-    all can agree to wins. Points outside an image or behind a camera get zero from it: nothing is said.
+    all can agree to wins. Points outside an image or behind a camera get zero from it, which is
+    what an even map says; such views count in the mean.
     """
     batch, joint, point, _ = clouds_world.shape
     uv_px, depth = project(cams.K, cams.T_cam_from_world, clouds_world.reshape(batch, 1, joint * point, 3))

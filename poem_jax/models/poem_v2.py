@@ -15,13 +15,13 @@ from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, primary_view
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.model import HandModel, template_queries
-from poem_jax.hand.topology import join_queries, split_queries
+from poem_jax.hand.topology import join_queries
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import HRNet, ResNet
 from poem_jax.models.config import Config, DecoderOutput, Design, FirstQueries, HRNetConfig
 from poem_jax.models.decoder import Decoder, Surroundings
-from poem_jax.models.hand_output import ParameterRegressor, first_queries, root_relative_mesh
-from poem_jax.models.heat_maps import FALLBACK_ROOT, HeatMapBranch, root_point, triangulate_joints
+from poem_jax.models.hand_output import ParameterRegressor, draw_in, first_queries, root_relative_mesh
+from poem_jax.models.heat_maps import HeatMapBranch, root_point, triangulate_joints
 from poem_jax.models.joint_decoder import JointDecoder
 from poem_jax.models.layers import NormMode, trunk_images
 from poem_jax.models.network import Constant, HandConstants
@@ -46,7 +46,7 @@ class ViewFeatures(NamedTuple):
     feature_maps: Float[Array, "*batch h w c"]
     """Without the release's position code, which depends on the other views."""
     evidence: Float[Array, "*batch joint h w"] | None
-    """Logarithms of `heat_maps` over an even one, for the joint decoder; None without one."""
+    """Of `heat_maps`, for the joint decoder (`point_features.evidence`); None without one."""
 
 
 class AnchorConstants(nnx.Module):
@@ -121,17 +121,18 @@ class Poem(nnx.Module):
         joints = jax.lax.stop_gradient(reference_joints) if mode.training else reference_joints
         root, valid = root_point(joints, solved, frame.known_root, cams.view_mask)
 
-        all_solved = jnp.all(solved, -1)
-        joint_layers = self._move_joints(joints, all_solved, seen, cams, mode)
-        starts = [self._start(at - root[:, None], all_solved) for at in [joints, *joint_layers]]
+        all_solved, about_root = jnp.all(solved, -1), joints - root[:, None]
+        moved_joints = self._move_joints(about_root, root, seen, cams, mode)
+        joint_layers = [self._start(at, all_solved) for at in moved_joints]
+        start = joint_layers[-1] if joint_layers else self._start(about_root, all_solved)
         basis_features = self._read_views(seen.feature_maps, cams, root)
         first = self.first_surroundings() if first is None else first
         moved, embeddings = self.decoder(
-            starts[-1] / radius, self.basis_points[...] / radius, basis_features, first, dropout_key
+            start / radius, self.basis_points[...] / radius, basis_features, first, dropout_key
         )
 
         hand, parameters = self.hand.model(), None
-        layers = [*starts[1:], *(radius * queries for queries in moved)]
+        layers = [*joint_layers, *(radius * queries for queries in moved)]
         if self.regressor is not None:
             parameters = self.regressor(embeddings)
             layers.append(join_queries(*root_relative_mesh(hand, parameters), config.decoder.query_order))
@@ -178,23 +179,20 @@ class Poem(nnx.Module):
         return self.aggregation(sampled, cams.view_mask, primary_view(cams.view_mask))
 
     def _move_joints(
-        self, joints: Array, solved: Array, seen: ViewFeatures, cams: Cameras, mode: NormMode
+        self, joints: Array, root: Array, seen: ViewFeatures, cams: Cameras, mode: NormMode
     ) -> list[Float[Array, "batch 21 3"]]:
-        """Return the joints after every layer of the joint decoder; unsolved samples keep theirs."""
+        """Return the joints after every layer of the joint decoder; they, and `joints`, about the root.
+
+        Joints that went astray are drawn in beforehand, as they are before they pose the template.
+        """
         if self.joint_decoder is None:
             return []
         assert seen.evidence is not None
-        kept = solved[:, None, None]
-        start = jnp.where(kept, joints, self._resting_joints())
+        start = draw_in(joints, self.config.basis.radius) + root[:, None]
         moved = self.joint_decoder(
             start, seen.evidence, seen.feature_maps, cams, self.config.image_hw, training=mode.training
         )
-        return [jnp.where(kept, at, joints) for at in moved]
-
-    def _resting_joints(self) -> Float[Array, "21 3"]:
-        """Return the template's joints before the primary camera: joints that span a hand's frame."""
-        template = split_queries(self.template_queries[...], self.config.decoder.query_order)[1]
-        return template + jnp.array(FALLBACK_ROOT, template.dtype)
+        return [at - root[:, None] for at in moved]
 
     def _start(self, joints: Array, solved: Array) -> Float[Array, "batch query 3"]:
         """Return the query points before the first layer, metres about the root."""

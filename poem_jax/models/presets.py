@@ -27,6 +27,7 @@ from poem_jax.models.config import (
     FirstQueries,
     FrozenNorms,
     HeatActivation,
+    JointDecoderConfig,
     ModelConfig,
     ResNetConfig,
     RootConfig,
@@ -91,6 +92,7 @@ TINY = Config(
     features=FeatureConfig(stride=4, heat_maps=True),
     basis=BasisConfig(num_points=1024),
     aggregation=AggregationConfig(similarity=Similarity.EQUAL),
+    joint_decoder=JointDecoderConfig(),
     decoder=DecoderConfig(
         num_layers=2,
         num_neighbours=8,

@@ -202,8 +202,7 @@ class TrainConfig:
     """Steps at the beginning that train trunk and heat maps alone, for less than half the cost of a whole
     step: the second stage then starts from joints that mean something. Adam's moments start anew after."""
     frozen_views: bool = False
-    """What is done with every view alone stays as it is, batch norms included: the second stage learns, for a
-    third of the cost."""
+    """What is done with every view alone stays as it is, batch norms included; the second stage learns."""
     training_root: TrainingRoot = PAPER_ROOT
     optimizer: OptimizerConfig = OptimizerConfig()
     train: RunConfig = RunConfig()
@@ -226,6 +225,10 @@ class TrainConfig:
         require(
             not (self.frozen_views and self.first_stage_steps),
             f"`first_stage_steps` train what `frozen_views` keeps; got {self.first_stage_steps} of them",
+        )
+        require(
+            not self.frozen_views or run.init_from is not None,
+            "`frozen_views` keeps what `train.init_from` gives; name a folder of weights there, or `shipped`",
         )
         require(
             not (self.frozen_views and self.optimizer.weight_decay),
@@ -302,13 +305,25 @@ def config_json(config: TrainConfig) -> str:
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Describe the fields in which two flattened configs differ, bookkeeping aside."""
-    ours, theirs = _learned(new), _learned(old)
+    ours = _learned(new)
+    theirs = {key: value for key, value in _LATER.items() if key in ours} | _learned(old)
     missing = "absent"
     return [
         f"{key}: {theirs.get(key, missing)} -> {ours.get(key, missing)}"
         for key in sorted(ours.keys() | theirs.keys())
         if theirs.get(key, missing) != ours.get(key, missing)
     ]
+
+
+_LATER = {
+    "frozen_views": False,
+    "model.joint_decoder": None,
+    "model.backbone.frozen_norms": "none",
+    "loss.reprojection_limit": 0.5,
+    "loss.triangulation": 0.0,
+    "loss.vertex_reprojection": 0.0,
+}
+"""Fields that runs of earlier versions do not name, and what they did."""
 
 
 def _learned(flat: dict[str, Any]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from poem_jax.weights.store import shipped
 
 SEED, SAMPLES, VIEWS = 987654, 64, 4
 """Of the captures, on which no model was trained or chosen."""
-MAX_MPVPE_MM = 10.1
-"""On these captures; 9.89 when it was set. Better weights lower it."""
+MAX_MPVPE_MM = 7.4
+"""On these captures; 7.22 when it was set. Better weights lower it."""
 
 
 @pytest.fixture(scope="module")
@@ -38,25 +38,24 @@ def test_it_has_not_got_worse(errors) -> None:
     assert errors.own.mean() <= MAX_MPVPE_MM
 
 
-@pytest.mark.parametrize(("features", "margin_mm"), [("zero", 0.5), ("another", 0.25)])
-def test_its_second_stage_reads_the_images(errors, features: str, margin_mm: float) -> None:
-    """On the same captures it is worse without its features, and with those of another capture.
+@pytest.mark.parametrize("features", ["zero", "another"])
+def test_its_second_stage_reads_the_images(errors, features: str) -> None:
+    """On the same captures it is worse by half, at least, without its features, and with those of another
+    capture; by 343 and 241 % when this was written.
 
-    By 22 and 0.5 mm when this was written; zeros never occur in training, so the second says more. A second
-    stage that ignores its features differs by nothing, one that ignores whose they are in the first case
-    alone.
+    Zeros never occur in training, so the second says more. A second stage that ignores its features differs
+    by nothing, one that ignores whose they are in the first case alone.
     """
     worse = paired_difference(getattr(errors, features), errors.own)
     print(worse)
-    assert worse.mean_mm >= margin_mm
-    assert worse.mean_mm >= 3 * worse.standard_error_mm
+    assert worse.mean_mm - 3 * worse.standard_error_mm >= 0.5 * errors.own.mean()
 
 
 def test_its_second_stage_gains_on_the_first(errors) -> None:
-    """Little, so far: 0.13 mm on the template posed by the triangulated joints when this was written."""
+    """A quarter, at least, on the template posed by the triangulated joints; 28 % when this was written."""
     gain = paired_difference(errors.posed, errors.own)
     print(gain)
-    assert gain.mean_mm >= 2 * gain.standard_error_mm > 0
+    assert gain.mean_mm >= 0.25 * errors.posed.mean()
 
 
 @pytest.mark.slow
@@ -69,4 +68,4 @@ def test_more_views_are_better(captures) -> None:
     print(means)
     assert np.all(np.diff(means) < 0)
     assert means[1] <= MAX_MPVPE_MM + 0.2
-    assert means[1] <= scores[4]["mean_pose_mpvpe_mm"] / 5
+    assert means[1] <= scores[4]["mean_pose_mpvpe_mm"] / 7

@@ -83,6 +83,7 @@ EARLIER_TINY = replace(
     root=replace(preset("tiny").root, stride=8),
     features=FeatureConfig(),
     aggregation=AggregationConfig(similarity=Similarity.MEAN),
+    joint_decoder=None,
     decoder=replace(preset("tiny").decoder, neighbour_search=NeighbourSearch.ONCE),
 )
 """`tiny` as it was first shipped."""
@@ -188,3 +189,26 @@ def test_configs_are_immutable():
     with pytest.raises(AttributeError):
         config.width = 3  # pyright: ignore[reportAttributeAccessIssue]
     assert replace(config, width=128) == preset("v2-small")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"), [(3, "must be an object"), ({"kind": "Other"}, "must be one of")]
+)
+def test_a_part_that_may_be_absent_is_whole_or_null(value, message):
+    text = json.loads(to_json(preset("tiny")))
+    assert from_json(json.dumps({**text, "joint_decoder": None})) == replace(
+        preset("tiny"), joint_decoder=None
+    )
+    with pytest.raises(ValueError, match=f"`config.joint_decoder.*{message}"):
+        from_json(json.dumps({**text, "joint_decoder": value}))
+
+
+def test_a_trunk_may_not_be_absent():
+    text = json.loads(to_json(preset("tiny")))
+    with pytest.raises(ValueError, match=r"`config\.backbone` must be an object; got None"):
+        from_json(json.dumps({**text, "backbone": None}))
+
+
+def test_a_stem_has_a_block_that_widens_and_others():
+    with pytest.raises(ValueError, match="`stem_blocks` must be at least 2; got 1"):
+        HRNetConfig(stem_blocks=1)

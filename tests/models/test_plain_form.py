@@ -222,6 +222,20 @@ def test_tiny(compare, micro_config):
     assert max(compare(_like_tiny(micro_config), root=unknown)) < LARGEST_M
 
 
+def test_joint_decoder(plain_form, joints_config, make_params, make_scene):
+    """Against the plain form's own layers, by the package's geometry, in float64."""
+    with jax.enable_x64(True):
+        params = _float64(_damped(make_params(joints_config)))
+        images, cams = make_scene(1, VIEWS)
+        cams = _float64(cams)
+        expected, _ = _plain(plain_form, "forward", joints_config)(params, images, cams)
+        found = apply.apply(params, images, cams, config=joints_config)
+        apart = np.linalg.norm(found.layers_world - expected.layers, axis=-1)
+        moved = np.linalg.norm(found.joints_world - found.reference_joints_world, axis=-1)
+    assert moved.max() > 1e-4
+    assert apart.max() < LARGEST_M
+
+
 @pytest.mark.parity
 @pytest.mark.parametrize("like", [lambda micro: micro, _like_release], ids=["paper", "release"])
 def test_float32_is_off_by_rounding(plain_form, micro_config, make_params, make_scene, like):

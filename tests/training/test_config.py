@@ -1,9 +1,11 @@
 """Experiment files, overrides, and the comparison of configs."""
 
+import json
 import shutil
 import subprocess
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -175,3 +177,12 @@ def test_differences_name_the_field_and_leave_bookkeeping_out(micro_config):
 def test_configs_hash_and_compare(micro_config):
     assert isinstance(micro_config, TrainConfig)
     assert hash(micro_config) == hash(replace(micro_config))
+
+
+def test_runs_of_earlier_versions_go_on():
+    """Fields that the stored config does not name had no other value then."""
+    file = Path(__file__).with_name("run_config_of_november_2026.json")
+    then, now = json.loads(file.read_text()), flatten_config(open_experiment("v2_nano_synthetic"))
+    assert then.keys() < now.keys()
+    assert differences(then, now) == []
+    assert differences(then, {**now, "frozen_views": True}) == ["frozen_views: False -> True"]

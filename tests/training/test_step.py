@@ -22,6 +22,7 @@ from poem_jax.training.config import (
     DataParallel,
     OptimizerConfig,
     RootSource,
+    RunConfig,
     Schedule,
     TrainingRoot,
 )
@@ -218,7 +219,7 @@ def test_first_stage_trains_the_heat_maps_alone(micro_params, config, micro_batc
 
 def test_frozen_views_leave_all_that_looks_at_one_view(micro_params, config, micro_batch):
     """Weights and batch-norm statistics; and the views look as they do at inference."""
-    frozen = replace(config, frozen_views=True)
+    frozen = replace(config, frozen_views=True, train=replace(config.train, init_from="somewhere"))
     state = create_state(micro_params, frozen)
     after, metrics = jax.jit(partial(train_step, config=frozen))(state, micro_batch, KEY)
     before = jax.tree.map(np.asarray, state.params)
@@ -226,6 +227,8 @@ def test_frozen_views_leave_all_that_looks_at_one_view(micro_params, config, mic
     for group, names in (("trainable", looking), ("statistics", before["statistics"])):
         for name in names:
             jax.tree.map(np.testing.assert_array_equal, after.params[group][name], before[group][name])
+            if after.ema is not None:
+                jax.tree.map(np.testing.assert_array_equal, after.ema[group][name], before[group][name])
     moved = jax.tree.map(lambda a, b: np.any(a != b), after.params["trainable"], before["trainable"])
     assert any(jax.tree.leaves(moved["decoder"]))
     seen = poem_jax.apply(micro_params, micro_batch.views, existing_views(micro_batch), config=config.model)
@@ -238,10 +241,12 @@ def test_frozen_views_leave_all_that_looks_at_one_view(micro_params, config, mic
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"train": RunConfig()}, "`frozen_views` keeps what `train.init_from` gives"),
         ({"first_stage_steps": 3}, "`first_stage_steps` train what `frozen_views` keeps"),
         ({"optimizer": OptimizerConfig(weight_decay=0.1)}, "would shrink the weights"),
     ],
 )
 def test_frozen_views_refuse_what_would_move_them(config, change, message):
+    started = replace(config, train=replace(config.train, init_from="somewhere"))
     with pytest.raises(ValueError, match=message):
-        replace(config, frozen_views=True, **change)
+        replace(started, frozen_views=True, **change)
