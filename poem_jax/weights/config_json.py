@@ -156,14 +156,10 @@ def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any,
 
 
 def _decode_union(value: Any, declared: Any, path: str) -> Any:
-    options = typing.get_args(declared)
-    if value is None and types.NoneType in options:
+    if value is None and types.NoneType in typing.get_args(declared):
         return None
-    dataclass_options = tuple(option for option in options if dataclasses.is_dataclass(option))
-    if len(dataclass_options) == len(options):
-        return _decode_one_of(value, options, path)
-    (declared,) = (option for option in options if option is not types.NoneType)
-    return _decode(value, declared, path)
+    options = _options(declared)
+    return _decode_one_of(value, options, path) if _is_choice(declared) else _decode(value, options[0], path)
 
 
 def _decode_one_of(value: Any, classes: tuple[type, ...], path: str) -> Any:
@@ -185,8 +181,13 @@ def _decode_dataclass(value: Any, declared: type[_T], path: str) -> _T:
 
 
 def _is_choice(declared: Any) -> bool:
-    """Whether a value may be of one of several dataclasses."""
-    return _is_union(declared) and types.NoneType not in typing.get_args(declared)
+    """Whether a value may be of one of several dataclasses, or of one or none."""
+    return _is_union(declared) and all(map(dataclasses.is_dataclass, _options(declared)))
+
+
+def _options(declared: Any) -> tuple[type, ...]:
+    """Return what a value may be but None."""
+    return tuple(option for option in typing.get_args(declared) if option is not types.NoneType)
 
 
 def _is_union(declared: Any) -> bool:
