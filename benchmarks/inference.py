@@ -332,7 +332,7 @@ def _read(prepared, inputs):
 def _decode(prepared, inputs):
     start, tokens = inputs
     points = prepared.params["constants"]["basis_points"] / prepared.config.basis.radius
-    return _module(prepared).decoder(start, points, tokens, prepared.first)
+    return _module(prepared).decoder(start, points, tokens, prepared.constant["first"])
 
 
 def _module(prepared):
@@ -361,8 +361,8 @@ def _model(preset: str):
 
     import poem_jax
     from poem_jax.geometry.neighbours import farthest_points
+    from poem_jax.hand.model import template_queries
     from poem_jax.hand.template import default_hand
-    from poem_jax.models.hand_output import template_queries
     from poem_jax.models.network import describe
     from poem_jax.models.point_features import basis_points
 

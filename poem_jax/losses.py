@@ -5,7 +5,7 @@ Every mean runs over what exists: padded views (`view_mask`), padded samples (`s
 could not be solved (`Prediction.valid`) change neither a loss nor a gradient.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from typing import NamedTuple
@@ -50,7 +50,7 @@ class PoseSpace(Enum):
 
 @dataclass(frozen=True)
 class LossRecipe:
-    """Weights and forms of the terms of `multi_view_losses`; the defaults are the release's."""
+    """Weights and forms of the terms of `multi_view_losses`; the defaults are POEM v2's release's."""
 
     name: str
     layers: Layers = Layers.LAST
@@ -62,6 +62,8 @@ class LossRecipe:
     it. It tells every cell what to do, where the coordinates' loss tells only their mean."""
     heat_map_sigma: float = 0.75
     """Spread of that Gaussian, in cells."""
+    triangulation: float = 0.0
+    """All 21 triangulated joints of the first stage, squared errors in square metres."""
     joints: float = 1.0
     regressed_joints: float = 1.0
     """Joints regressed from the vertices."""
@@ -69,7 +71,12 @@ class LossRecipe:
     vertices: float = 1.0
     """Always an L1 loss."""
     reprojection: float = 1.0
-    """Projected joints, in diagonals, clamped to half a diagonal per coordinate."""
+    """Projected joints, in diagonals, clamped to `reprojection_limit`."""
+    vertex_reprojection: float = 0.0
+    """Projected vertices in the same form, against the projected true ones."""
+    reprojection_limit: float = 0.5
+    """Diagonals. A coordinate of a projected point that is farther off counts as this far, without
+    gradient."""
     reprojection_penalty: Penalty = Penalty.SQUARED
     pose: float = 0.001
     pose_space: PoseSpace = PoseSpace.AXIS_ANGLE
@@ -96,7 +103,21 @@ SYNTHETIC = LossRecipe(
 )
 """For short runs: absolute errors, points in units of 10 cm; the 2D term does not fade as it shrinks."""
 
-RECIPES = {recipe.name: recipe for recipe in (RELEASE, PAPER, SYNTHETIC)}
+V1 = LossRecipe("v1", layers=Layers.EVERY, triangulation=10.0)
+"""POEM v1 as released: heat-map coordinates and triangulated joints, and every layer, summed."""
+
+V1_ONE_STAGE = replace(V1, name="v1-1stage", keypoints=0.0, triangulation=0.0)
+"""Its ablation without a first stage."""
+
+MESH_TRANSFORMER = replace(V1_ONE_STAGE, name="meshtr", reprojection_limit=1.0)
+"""PE-MeshTR and FTL-MeshTR as released."""
+
+MVP = replace(MESH_TRANSFORMER, name="mvp", vertex_reprojection=1.0)
+"""MvP as released."""
+
+RECIPES = {
+    recipe.name: recipe for recipe in (RELEASE, PAPER, SYNTHETIC, V1, V1_ONE_STAGE, MESH_TRANSFORMER, MVP)
+}
 
 
 _HEAT_FLOOR = 1e-8
@@ -143,9 +164,10 @@ def multi_view_losses(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Compute the weighted training loss and its unweighted terms.
 
-    The terms are the release's: `keypoints`, `joints`, `regressed_joints`, `vertices`,
-    `reprojection`, and for parametric predictions `pose` and `shape`. L1 terms are taken in the primary
-    camera's frame, so that no choice of the world frame changes the loss.
+    The terms are those of the releases: `keypoints` (of a model with heat maps), `joints`,
+    `regressed_joints`, `vertices`, `reprojection`, for parametric predictions `pose` and `shape`, and where
+    the recipe weighs them `heat_maps`, `triangulation` and `vertex_reprojection`. L1 terms are taken in the
+    primary camera's frame, so that no choice of the world frame changes the loss.
 
     Args:
         prediction: the model's output; `keypoints_px` holds the root joint only, or all 21.
@@ -158,13 +180,20 @@ def multi_view_losses(
 
     Returns:
         The loss, and the terms by name (of the last layer; point terms in `recipe.point_unit_m`).
+
+    Raises:
+        ValueError: the recipe weighs what the prediction does not have: key points or triangulated joints.
     """
     view_mask, sample_mask = valid_masks(prediction, batch)
     diagonal = _diagonal(image_hw)
     cameras = fill_masked_views(Cameras(batch.cameras.K, batch.cameras.T_cam_from_world, view_mask))
     truth = _Points(batch.joints_world, batch.vertices_world)
 
-    terms_2d = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=recipe, axis_name=axis_name)
+    first_stage = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=recipe, axis_name=axis_name)
+    if recipe.triangulation:
+        reference = _present(prediction.reference_joints_world, "triangulation", recipe)
+        residual = reference - truth.joints
+        first_stage["triangulation"] = masked_mean(residual**2, sample_mask, axis_name=axis_name)
 
     compare = partial(
         _point_terms,
@@ -179,11 +208,11 @@ def multi_view_losses(
     )
     layer_terms = [compare(points) for points in _supervised(prediction, recipe.layers, query_order)]
     terms = {
-        **terms_2d,
+        **first_stage,
         **layer_terms[-1],
         **_parametric_terms(prediction, batch, cameras, sample_mask, recipe.pose_space, axis_name),
     }
-    loss = weighted(terms_2d, recipe)
+    loss = weighted(first_stage, recipe)
     for term in layer_terms:
         loss += weighted(term, recipe)
     loss += weighted({name: terms[name] for name in ("pose", "shape") if name in terms}, recipe)
@@ -198,12 +227,17 @@ def keypoint_terms(
     recipe: LossRecipe,
     axis_name: str | None = None,
 ) -> dict[str, Float[Array, ""]]:
-    """Compute the terms of the first stage, `keypoints` and, where the recipe weighs it, `heat_maps`.
+    """Compute the terms of the first stage in the images, `keypoints` and, where the recipe weighs it,
+    `heat_maps`; none for a model without heat maps.
 
-    Arguments and masks as in `multi_view_losses`.
+    Arguments, masks and errors as in `multi_view_losses`.
     """
+    if recipe.keypoints:
+        _present(prediction.keypoints_px, "keypoints", recipe)
+    if prediction.keypoints_px is None:
+        return {}
     view_mask, _ = valid_masks(prediction, batch)
-    truth_px = match_keypoints(prediction, batch)
+    truth_px = match_keypoints(prediction.keypoints_px, batch)
     residual = (prediction.keypoints_px - truth_px) / _diagonal(image_hw)
     terms = {"keypoints": _mean_of_norms(residual, view_mask, recipe.keypoint_penalty, axis_name)}
     if recipe.heat_maps and prediction.heat_maps is not None:
@@ -211,6 +245,17 @@ def keypoint_terms(
         entropy = _cross_entropy(prediction.heat_maps, cells, recipe.heat_map_sigma)
         terms["heat_maps"] = masked_mean(entropy, view_mask, axis_name=axis_name)
     return terms
+
+
+def _present(value: Array | None, weight: str, recipe: LossRecipe) -> Array:
+    """Return what a weight of the recipe is about, or raise where the model does not give it."""
+    if value is None:
+        raise ValueError(
+            f"the loss recipe {recipe.name!r} weighs `{weight}` by {getattr(recipe, weight):g}, which the "
+            f"model does not give; set its weight to 0, or take the recipe of the model, one of "
+            f"{', '.join(RECIPES)}"
+        )
+    return value
 
 
 def weighted(terms: dict[str, Array], recipe: LossRecipe) -> Array:
@@ -243,9 +288,11 @@ def valid_masks(
     return view_mask, sample_mask & prediction.valid
 
 
-def match_keypoints(prediction: Prediction, batch: MultiViewBatch) -> Float[Array, "batch view joint 2"]:
+def match_keypoints(
+    keypoints_px: Float[Array, "batch view joint 2"], batch: MultiViewBatch
+) -> Float[Array, "batch view joint 2"]:
     """Return the true key points that belong to the predicted ones: the root joint, or all 21."""
-    if prediction.keypoints_px.shape[-2] == 1:
+    if keypoints_px.shape[-2] == 1:
         return batch.keypoints_px[..., ROOT_JOINT : ROOT_JOINT + 1, :]
     return batch.keypoints_px
 
@@ -271,7 +318,7 @@ def _point_terms(
     recipe: LossRecipe,
     axis_name: str | None,
 ) -> dict[str, Array]:
-    """Compute the four terms of one decoder layer."""
+    """Compute the four terms of one decoder layer, or five."""
     _, T_primary_from_world = anchor_to_primary(cameras.T_cam_from_world, cameras.view_mask)
     rotation = T_primary_from_world[..., :3, :3]
 
@@ -284,16 +331,25 @@ def _point_terms(
     regressed = joints_from_vertices(hand, points.vertices)
     regressed_truth = joints_from_vertices(hand, truth.vertices)
     view_mask = cameras.view_mask & sample_mask[:, None]
-    uv_px, _ = project(cameras.K, cameras.T_cam_from_world, points.joints[:, None])
-    residual_px = jnp.clip(uv_px - keypoints_px, -diagonal / 2, diagonal / 2)
-    return {
+
+    def in_images(points_world: Array, target_px: Array) -> Array:
+        residual = (_projected(cameras, points_world) - target_px) / diagonal
+        residual = jnp.clip(residual, -recipe.reprojection_limit, recipe.reprojection_limit)
+        return _mean_of_norms(residual, view_mask, recipe.reprojection_penalty, axis_name)
+
+    terms = {
         "joints": mean(difference(points.joints, truth.joints), recipe.joint_penalty),
         "regressed_joints": mean(difference(regressed, regressed_truth), recipe.joint_penalty),
         "vertices": mean(difference(points.vertices, truth.vertices), Penalty.ABSOLUTE),
-        "reprojection": _mean_of_norms(
-            residual_px / diagonal, view_mask, recipe.reprojection_penalty, axis_name
-        ),
+        "reprojection": in_images(points.joints, keypoints_px),
     }
+    if recipe.vertex_reprojection:
+        terms["vertex_reprojection"] = in_images(points.vertices, _projected(cameras, truth.vertices))
+    return terms
+
+
+def _projected(cameras: Cameras, points_world: Float[Array, "batch point 3"]) -> Array:
+    return project(cameras.K, cameras.T_cam_from_world, points_world[:, None])[0]
 
 
 def _parametric_terms(

@@ -22,12 +22,11 @@ from poem_jax.cli.export_torch import ExportTorch
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.run import parse
 from poem_jax.geometry.neighbours import farthest_points
-from poem_jax.hand.model import HandModel, mirror
+from poem_jax.hand.model import HandModel, mirror, template_queries
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.io.torch_file import load_state_dict, save_state_dict
 from poem_jax.models.config import Config, HRNetConfig
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.presets import PRESETS
 from poem_jax.training.config import flatten_config
 from poem_jax.typing import Params

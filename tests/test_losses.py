@@ -78,6 +78,7 @@ def random_case(views=3, batch=2, joints=1, seed=0) -> tuple[Prediction, MultiVi
         valid=np.ones(batch, bool),
         pose=normal(batch, 16, 3),
         shape=normal(batch, 10),
+        reference_joints_world=0.05 * normal(batch, 21, 3),
     )
     truth = MultiViewBatch(
         views=np.zeros((batch, views, *HW, 3), np.uint8),
@@ -285,7 +286,7 @@ def test_a_world_frame_changes_nothing(hand):
         joints_world=batch.joints_world @ R.T,
         vertices_world=batch.vertices_world @ R.T,
     )
-    fields = ("vertices_world", "joints_world", "layers_world")
+    fields = ("vertices_world", "joints_world", "layers_world", "reference_joints_world")
     turned = prediction._replace(**{name: getattr(prediction, name) @ R.T for name in fields})
     for recipe in RECIPES.values():
         options = {"hand": hand, "image_hw": HW, "recipe": recipe}

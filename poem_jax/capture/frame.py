@@ -47,7 +47,8 @@ class HandResult(NamedTuple):
     joint_sigma_m: Float[Array, "21"] | None = None
     """Standard deviation of one coordinate of each joint, where the engine knows it."""
     keypoints_px: Float[Array, "view joint 2"] | None = None
-    """Where a network's heat maps see the joints (the root alone, or all 21): pixels of the photographs."""
+    """Where a network's heat maps see the joints (the root alone, or all 21), if it has any: pixels of the
+    photographs."""
     reprojection_px: Float[Array, " view"] | None = None
     """Mean distance of the projected joints to the 2D evidence in each photograph; NaN = none there."""
     joints_shown: Float[Array, " view"] | None = None

@@ -33,7 +33,8 @@ class Evidence(NamedTuple):
 
 
 def judge_hands(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
-    """Compare hands with the 2D evidence: the key points that were given, else the network's own.
+    """Compare hands with the 2D evidence: the key points that were given, else the network's own, if it has
+    heat maps; without any the errors are NaN.
 
     Args:
         frames: With results.
@@ -85,18 +86,21 @@ def reprojection_error(
     return errors
 
 
-def _evidence(frame: Frame, index: int) -> Evidence:
+def _evidence(frame: Frame, index: int) -> Evidence | None:
+    """Return the key points that were given, else those of the heat maps, else None."""
     if frame.keypoints_px is not None:
         return Evidence(frame.keypoints_px[index], _ALL_JOINTS)
     points_px = frame.hands[index].keypoints_px
-    assert points_px is not None, "a hand comes from key points or from heat maps"
+    if points_px is None:
+        return None
     return Evidence(points_px, (ROOT_JOINT,) if points_px.shape[-2] == 1 else _ALL_JOINTS)
 
 
-def _measured(hand: HandResult, evidence: Evidence, rig: Rig) -> HandResult:
+def _measured(hand: HandResult, evidence: Evidence | None, rig: Rig) -> HandResult:
+    nothing = np.full(len(rig.names), np.nan)
     expected = hand.joints_world if hand.expected_world is None else hand.expected_world
     return hand._replace(
-        reprojection_px=reprojection_error(expected, evidence, rig),
+        reprojection_px=nothing if evidence is None else reprojection_error(expected, evidence, rig),
         joints_shown=joints_shown(hand.joints_world, hand.view_mask, rig),
     )
 

@@ -28,7 +28,9 @@ from poem_jax.geometry.distortion import distort
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.hand.model import mirror_pose
-from poem_jax.models.config import Config
+from poem_jax.hand.topology import ROOT_JOINT
+from poem_jax.models.apply import check_view_count
+from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
 from poem_jax.typing import Array, Int, Params
 from poem_jax.weights import store
@@ -43,7 +45,7 @@ UNDETERMINED = (
 class Network(NamedTuple):
     """A model in memory, ready to predict."""
 
-    config: Config
+    config: ModelConfig
     prepared: Prepared
     origin: str = "given"
     """Where the weights came from, for the report."""
@@ -64,7 +66,7 @@ def load_network(checkpoint: str | os.PathLike | None) -> Network:
     return make_network(config, params, "shipped weights" if checkpoint is None else str(checkpoint))
 
 
-def make_network(config: Config, params: Params, origin: str = "given") -> Network:
+def make_network(config: ModelConfig, params: Params, origin: str = "given") -> Network:
     """Prepare a model in memory.
 
     Raises: ValueError: The parameters are of another config.
@@ -77,10 +79,11 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
 
     The batch is padded with masked hands, so that one program serves takes of any length.
     """
+    check_view_count(network.config, take.rig.num_views, "the rig")
     num_hands = len(take.hand_sides)
     frames_together = max(1, MAX_BATCH // num_hands)
     for group in in_groups(frames, frames_together):
-        crops = [_seen_by_two(crop) for frame in group for crop in frame.crops]
+        crops = [_if_enough(crop, network.config) for frame in group for crop in frame.crops]
         sides = take.hand_sides * len(group)
         fed = [
             _mirrored(crop) if crop and side == "left" else crop
@@ -89,14 +92,19 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
         predicted = iter(_predict(network, fed, take.rig.num_views, frames_together * num_hands))
         for frame in group:
             results = (
-                _result(crop, next(predicted), known, side, take.rig)
+                _result(crop, next(predicted), known, side, take.rig, views_needed(network.config))
                 for crop, known, side in zip(frame.crops, frame.hands, take.hand_sides, strict=True)
             )
             yield frame._replace(hands=tuple(results), crops=())
 
 
-def _seen_by_two(crops: HandCrops | None) -> HandCrops | None:
-    return None if crops is None or crops.view_mask.sum() < 2 else crops
+def views_needed(config: ModelConfig) -> int:
+    """Return how many views must see a hand before a model can place it."""
+    return 2 if config.triangulates else 1
+
+
+def _if_enough(crops: HandCrops | None, config: ModelConfig) -> HandCrops | None:
+    return None if crops is None or crops.view_mask.sum() < views_needed(config) else crops
 
 
 def _mirrored(crops: HandCrops) -> HandCrops:
@@ -130,30 +138,38 @@ def _predict(
 
 
 def _result(
-    crops: HandCrops | None, predicted: Prediction | None, known: HandResult, side: str, rig: Rig
+    crops: HandCrops | None,
+    predicted: Prediction | None,
+    known: HandResult,
+    side: str,
+    rig: Rig,
+    needed: int,
 ) -> HandResult:
     """Bring a prediction back to the capture's world, or say why there is none."""
     if crops is None:
         return known
     views = int(crops.view_mask.sum())
-    if views < 2:
-        return HandResult(crops.view_mask, f"seen in {views} view(s); two are needed")
+    if views < needed:
+        wanted = "two are" if needed == 2 else "one is"
+        return HandResult(crops.view_mask, f"seen in {views} view(s); {wanted} needed")
     if predicted is None or not predicted.valid:
         return HandResult(crops.view_mask, UNDETERMINED)
     if side == "left":
         predicted = _mirrored_back(predicted, crops.views.shape[2])
-    behind = _behind(predicted.root_world, crops, rig)
+    # A model without a root of its own still says where the root joint is.
+    root_world = predicted.joints_world[ROOT_JOINT] if predicted.root_world is None else predicted.root_world
+    behind = _behind(root_world, crops, rig)
     if behind:
         return HandResult(crops.view_mask, f"the hand would lie behind camera {', '.join(behind)}")
     return HandResult(
         crops.view_mask,
         vertices_world=predicted.vertices_world,
         joints_world=predicted.joints_world,
-        root_world=predicted.root_world,
+        root_world=root_world,
         pose=predicted.pose,
         shape=predicted.shape,
         translation=predicted.translation,
-        keypoints_px=_in_photographs(predicted.keypoints_px, crops, rig),
+        keypoints_px=_where_given(lambda px: _in_photographs(px, crops, rig), predicted.keypoints_px),
     )
 
 
@@ -162,11 +178,16 @@ def _mirrored_back(predicted: Prediction, crop_width: int) -> Prediction:
     return predicted._replace(
         vertices_world=mirror_points(predicted.vertices_world),
         joints_world=mirror_points(predicted.joints_world),
-        root_world=mirror_points(predicted.root_world),
-        keypoints_px=mirror_pixels(predicted.keypoints_px, crop_width),
-        pose=None if predicted.pose is None else mirror_pose(predicted.pose),
-        translation=None if predicted.translation is None else mirror_points(predicted.translation),
+        root_world=_where_given(mirror_points, predicted.root_world),
+        keypoints_px=_where_given(lambda px: mirror_pixels(px, crop_width), predicted.keypoints_px),
+        pose=_where_given(mirror_pose, predicted.pose),
+        translation=_where_given(mirror_points, predicted.translation),
     )
+
+
+def _where_given(change: Callable[[Array], Array], value: Array | None) -> Array | None:
+    """Change what the model gives; leave None for what it does not have."""
+    return None if value is None else change(value)
 
 
 def _behind(root_world: Array, crops: HandCrops, rig: Rig) -> list[str]:

@@ -17,6 +17,8 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.io.atomic import whole_file
 from poem_jax.typing import Array, Float
 
+_NOTHING = "nothing, for the model has no heat maps"
+
 
 class Clock:
     """Seconds spent per activity; those inside of others count for themselves alone."""
@@ -87,8 +89,11 @@ class Report:
         self.failed_frames += not solved and (
             bool(frame.problems) or any(hand.view_mask.any() for hand in frame.hands)
         )
-        if frame.keypoints_px is None:
-            self._against = "the model's own heat maps"
+        if frame.keypoints_px is None and self._against != _NOTHING:
+            no_maps = bool(solved) and all(
+                np.isnan(np.asarray(hand.reprojection_px, float)).all() for hand in solved
+            )
+            self._against = _NOTHING if no_maps else "the model's own heat maps"
         self._errors += [np.asarray(hand.reprojection_px, np.float32) for hand in solved]
         self._views_used += sum(int(hand.view_mask.sum()) for hand in frame.hands)
         self._keep_reasons(frame)

@@ -12,7 +12,7 @@ from poem_jax.cli.options import Experiment, Flag, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.hand.model import HandModel
-    from poem_jax.models.config import Config
+    from poem_jax.models.config import ModelConfig
     from poem_jax.synthetic.config import SyntheticConfig
     from poem_jax.synthetic.dataset import SyntheticDataset
     from poem_jax.training.config import TrainConfig
@@ -57,6 +57,7 @@ class Eval:
         """Evaluate, print the tables, and write the file."""
         from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
         from poem_jax.evaluation.protocols import PROTOCOLS
+        from poem_jax.evaluation.stages import check_has_stages
         from poem_jax.evaluation.tables import format_report, write_json
         from poem_jax.experiments import open_experiment
         from poem_jax.io.writable import check_file_is_writable
@@ -81,6 +82,8 @@ class Eval:
             progress=not self.no_progress,
         )
         config = open_experiment(self.experiment)
+        if self.stages:
+            check_has_stages(config.model)
         captures = SyntheticDataset(captures_config(config), seed=self.seed)
         weights = self.checkpoint or SHIPPED
         _, params = load(weights, expected=config.model)
@@ -98,7 +101,7 @@ class Eval:
         if self.stages:
             self._print_stages(params, config.model, captures)
 
-    def _print_stages(self, params: "Params", model: "Config", captures: "SyntheticDataset") -> None:
+    def _print_stages(self, params: "Params", model: "ModelConfig", captures: "SyntheticDataset") -> None:
         from poem_jax.evaluation.stages import format_stages, stage_errors
 
         samples, size = self.samples - self.samples % self.batch_size, self.batch_size

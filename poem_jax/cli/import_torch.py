@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from poem_jax.cli.messages import tells_what_is_left
-from poem_jax.cli.options import File, Flag, Folder
+from poem_jax.cli.options import File, Flag, Folder, OptionalFolder
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,32 @@ class ImportTorch:
 
     checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CKPT")]
     """The released .pth.tar."""
-    variant: Literal["v2-small", "v2-medium", "v2-large", "v2-medium-mano"]
+    variant: Literal[
+        "v2-small",
+        "v2-medium",
+        "v2-large",
+        "v2-medium-mano",
+        "v1",
+        "v1-g-emb",
+        "v1-gv-emb",
+        "v1-full-emb",
+        "v1-wo-proj",
+        "pe-meshtr",
+        "ftl-meshtr",
+        "mvp",
+    ]
     """Which of the released models it is."""
     mano: File
     """MANO_RIGHT.pkl from mano.is.tue.mpg.de, or an npz with MANO's names."""
-    assets: Folder
-    """The folder assets of the authors' repository: bps.npy, anchor.npy, anchor_idx.npy."""
     out: Folder
     """Folder to make for the model."""
+    assets: OptionalFolder = None
+    """The folder assets of the authors' repository: bps.npy, anchor.npy, anchor_idx.npy; for POEM v2 alone,
+    which needs it."""
+    dataset: Literal["dexycb", "ho3d", "oakink"] = "dexycb"
+    """What a model of POEM v1 or a baseline was trained on."""
+    num_views: int = 8
+    """Views that the layers of an MvP are made for."""
     accept_anchors: Flag = False
     """Take anchors that do not lie on the template of the hand."""
     overwrite: Flag = False
@@ -47,8 +65,10 @@ class ImportTorch:
                 self.checkpoint,
                 self.variant,
                 mano=self.mano,
-                assets=self.assets,
                 out=self.out,
+                assets=self.assets,
+                dataset=self.dataset,
+                num_views=self.num_views,
                 accept_anchors=self.accept_anchors,
                 overwrite=self.overwrite,
             )

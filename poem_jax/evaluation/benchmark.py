@@ -22,7 +22,7 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.apply import apply
-from poem_jax.models.config import Config
+from poem_jax.models.config import ModelConfig
 from poem_jax.typing import Array, Params
 
 DEFAULT_SEED = 20261122
@@ -30,7 +30,7 @@ DEFAULT_SEED = 20261122
 MAX_VIEWS = 8
 
 Scores = dict[str, float | int | None]
-"""Metrics of one view count; None where one cannot be had (a root from one view)."""
+"""Metrics of one view count; None where one cannot be had (a root from one view, or of a model without)."""
 
 
 @runtime_checkable
@@ -67,12 +67,12 @@ class BenchmarkSettings:
 
 
 class Reconstructions(NamedTuple):
-    """A batch reconstructed twice. With one view only the second is possible, and is both."""
+    """A batch reconstructed twice. Where one view does not fix the root, the second is both."""
 
     found: Prediction
-    """The model as it is used: it finds the root itself."""
-    given: Prediction
-    """With the true root given."""
+    """The model as it is used: it finds the root itself, or needs none."""
+    given: Prediction | None
+    """With the true root given; None for a model that takes none."""
 
 
 Predictor = Callable[[MultiViewBatch], Reconstructions]
@@ -84,7 +84,9 @@ class _Rows(NamedTuple):
     joints: np.ndarray
     vertices: np.ndarray
     root: np.ndarray
+    """NaN for a model without a root."""
     vertices_given: np.ndarray
+    """NaN for a model that takes no root."""
     valid: np.ndarray
     dlt_root: np.ndarray
 
@@ -99,13 +101,21 @@ class _Truth(NamedTuple):
 _Leaves = TypeVar("_Leaves", _Rows, _Truth)
 
 
-def model_predictor(params: Params, config: Config) -> Predictor:
-    """Return the predictor of a model; every shape of batch compiles once."""
+def model_predictor(params: Params, config: ModelConfig) -> Predictor:
+    """Return the predictor of a model; every shape of batch compiles once.
+
+    The predictor raises `ValueError` for numbers of views that the model cannot take.
+    """
     both, given = (jax.jit(partial(f, config=config)) for f in (_reconstruct, _reconstruct_given))
 
     def predict(batch: MultiViewBatch) -> Reconstructions:
-        root_true = batch.joints_world[:, ROOT_JOINT]
-        reconstruct = given if batch.views.shape[1] == 1 else both
+        root_true, num_views = batch.joints_world[:, ROOT_JOINT], batch.views.shape[1]
+        if num_views == 1 and config.triangulates and not config.takes_root:
+            raise ValueError(
+                f"this {type(config).__name__} needs two views or more, for one view does not fix the root, "
+                "and it takes none; leave 1 out of the view counts"
+            )
+        reconstruct = given if num_views == 1 and config.takes_root else both
         return reconstruct(params, batch.views, batch.cameras, root_true)
 
     return predict
@@ -124,7 +134,8 @@ def run_benchmark(
 
     Returns: per view count the metrics of `evaluate`, and `median_mpvpe_mm`, `mpvpe_true_root_mm` and its
     `median_`, `root_error_mm`, `dlt_2px_root_error_mm`, `mean_pose_mpvpe_mm`, `mean_pose_rotated_mpvpe_mm`,
-    `samples` and `unsolved` (samples that the model itself calls invalid; they count in all errors).
+    `samples` and `unsolved` (samples that the model itself calls invalid; they count in all errors). Errors
+    of a root that the model does not have, or with a true root that it does not take, are None.
 
     Raises:
         ValueError: a prediction that is not finite.
@@ -164,14 +175,16 @@ def _batches(captures: Captures, settings: BenchmarkSettings) -> Iterator[MultiV
 
 
 def _reconstruct(
-    params: Params, views: Array, cams: Cameras, root_true: Array, *, config: Config
+    params: Params, views: Array, cams: Cameras, root_true: Array, *, config: ModelConfig
 ) -> Reconstructions:
     found = apply(params, views, cams, config=config)
+    if not config.takes_root:
+        return Reconstructions(found, None)
     return Reconstructions(found, apply(params, views, cams, config=config, root_world=root_true))
 
 
 def _reconstruct_given(
-    params: Params, views: Array, cams: Cameras, root_true: Array, *, config: Config
+    params: Params, views: Array, cams: Cameras, root_true: Array, *, config: ModelConfig
 ) -> Reconstructions:
     given = apply(params, views, cams, config=config, root_world=root_true)
     return Reconstructions(given, given)
@@ -188,11 +201,13 @@ def _row(batch: MultiViewBatch, predicted: Reconstructions, noise: np.ndarray) -
     found, given = predicted
     K, T_cam_from_world, _ = batch.cameras
     root_px = batch.keypoints_px[:, :, ROOT_JOINT]
+    vertices = _float64(found.vertices_world)
+    no_root = np.full((len(vertices), 3), np.nan)
     return _Rows(
         joints=_float64(found.joints_world),
-        vertices=_float64(found.vertices_world),
-        root=_float64(found.root_world),
-        vertices_given=_float64(given.vertices_world),
+        vertices=vertices,
+        root=no_root if found.root_world is None else _float64(found.root_world),
+        vertices_given=np.full_like(vertices, np.nan) if given is None else _float64(given.vertices_world),
         valid=np.asarray(found.valid),
         dlt_root=noisy_dlt_roots(root_px, K, T_cam_from_world, noise),
     )
@@ -224,8 +239,8 @@ def _scores(rows: _Rows, truth: _Truth, protocol: str, hand: HandModel | None) -
     )
     return official | {
         "median_mpvpe_mm": float(np.median(found)),
-        "mpvpe_true_root_mm": float(given.mean()),
-        "median_mpvpe_true_root_mm": float(np.median(given)),
+        "mpvpe_true_root_mm": None if np.isnan(given).any() else float(given.mean()),
+        "median_mpvpe_true_root_mm": None if np.isnan(given).any() else float(np.median(given)),
         "root_error_mm": _mean_mm(rows.root, root_true),
         "dlt_2px_root_error_mm": _mean_mm(rows.dlt_root, root_true),
         "mean_pose_mpvpe_mm": float(constant.mean()),

@@ -1,4 +1,4 @@
-"""Which stage of a model does the work: its errors when one part is replaced by the truth, or by nothing.
+"""Which stage of a POEM v2 model does the work: its errors with a part replaced by the truth, or by nothing.
 
 The first stage looks at every view alone (`Poem.look`), the second joins the views (`Poem.find_hands`).
 Between the two, feature maps, key points and root can be replaced, and nothing else. A second stage that
@@ -16,11 +16,12 @@ from poem_jax.data.batching import collate
 from poem_jax.evaluation.protocols import MM_PER_METRE
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT, split_queries
-from poem_jax.models.config import Config
+from poem_jax.models.config import Config, ModelConfig
 from poem_jax.models.hand_output import first_queries
 from poem_jax.models.heat_maps import root_point, triangulate_joints
 from poem_jax.models.layers import NormMode
-from poem_jax.models.network import ViewFeatures, assemble, number_type
+from poem_jax.models.network import assemble, number_type
+from poem_jax.models.poem_v2 import ViewFeatures
 from poem_jax.models.world_frame import Reconstruction, enter_working_frame, leave_working_frame
 from poem_jax.synthetic.dataset import SyntheticSample
 from poem_jax.typing import Array, Float, Num, Params
@@ -74,7 +75,7 @@ class PairedDifference(NamedTuple):
 
 def stage_errors(
     params: Params,
-    config: Config,
+    config: ModelConfig,
     captures: RenderedCaptures,
     *,
     samples: int,
@@ -92,8 +93,9 @@ def stage_errors(
         batch_size: captures at a time, at least 2; one gets the feature maps of the one before it.
 
     Raises:
-        ValueError: counts other than these, or captures with masked views.
+        ValueError: a model that is not of POEM v2, counts other than these, or captures with masked views.
     """
+    config = check_has_stages(config)
     if batch_size < 2 or samples < 1 or samples % batch_size:
         raise ValueError(
             "`samples` must be a multiple of `batch_size`, and that at least 2, for features are exchanged "
@@ -108,6 +110,16 @@ def stage_errors(
             _errors_of_batch(params, config, [captures.render_sample(n, num_views) for n in numbers])
         )
     return StageErrors(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def check_has_stages(config: ModelConfig) -> Config:
+    """Return a config of POEM v2; raise `ValueError` for another system's."""
+    if not isinstance(config, Config):
+        raise ValueError(
+            f"stages can be told apart in POEM v2's models only; got a {type(config).__name__}. Evaluate it "
+            "without `--stages`"
+        )
+    return config
 
 
 def paired_difference(
@@ -232,7 +244,7 @@ def _pose(
     hand, order = model.hand.model(), config.decoder.query_order
     posed = first_queries(
         hand,
-        model.template_queries[...],
+        model.template_queries[...],  # pyright: ignore[reportAttributeAccessIssue]
         joints - root[:, None],
         jnp.all(solved, -1),
         config.basis.radius,

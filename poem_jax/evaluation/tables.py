@@ -60,7 +60,9 @@ mean pose        baseline at the true root: the captures' mean mesh in the prima
 turned           baseline at the true root: their mean hand, turned by the true global rotation"""
 JOINTS_LEGEND = "joint columns: the 21 joints that the model predicts, not joints regressed from its vertices"
 REGRESSED_LEGEND = "joint columns: joints regressed from the vertices of both sides; AUC-J: predicted joints"
-GIVEN_ROOT_LEGEND = f"{GIVEN_ROOT_MARK} one view does not fix the root: the true one is given to the model"
+GIVEN_ROOT_LEGEND = (
+    f"{GIVEN_ROOT_MARK} one view does not fix the root: the true one is given to a model that takes one"
+)
 
 
 def format_report(results: Mapping[int, Scores], *, regressed_joints: bool = False) -> str:

@@ -18,10 +18,13 @@ from poem_jax.hand.topology import (
     NUM_SHAPES,
     NUM_SKELETON_JOINTS,
     NUM_VERTICES,
+    ROOT_JOINT,
     SKELETON_FINGERS,
     TIP_VERTICES_LAYER,
     TIP_VERTICES_LAYER_LEFT,
     TIP_VERTICES_REGRESSED,
+    QueryOrder,
+    join_queries,
     openpose_joints,
 )
 from poem_jax.typing import Array, Bool, Float, Int, array_namespace
@@ -214,3 +217,12 @@ def _rotate(matrices: Array, vectors: Array) -> Array:
 
 def _moved(mesh: HandMesh, offset: Float[Array, "*batch 3"]) -> HandMesh:
     return HandMesh(mesh.vertices + offset[..., None, :], mesh.joints + offset[..., None, :])
+
+
+def template_queries(
+    hand: HandModel, order: QueryOrder, *, center_joint: int = ROOT_JOINT
+) -> Float[Array, "799 3"]:
+    """Return the flat mean hand about its root joint, or another (OpenPose order), metres."""
+    dtype = hand.v_template.dtype
+    zero_pose, mean_shape = np.zeros((NUM_SKELETON_JOINTS, 3), dtype), np.zeros(NUM_SHAPES, dtype)
+    return join_queries(*hand_mesh(hand, zero_pose, mean_shape, center_joint=center_joint), order)

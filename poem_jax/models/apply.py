@@ -12,23 +12,23 @@ from flax import nnx
 
 from poem_jax.batch import Prediction
 from poem_jax.geometry.camera_checks import check_cameras
-from poem_jax.geometry.cameras import Cameras, fill_masked_views, normalised_from_pixels
+from poem_jax.geometry.cameras import Cameras, fill_masked_views, normalised_from_pixels, project
 from poem_jax.geometry.transforms import invert_rigid, rotate_points
-from poem_jax.geometry.triangulation import MIN_BASELINE
+from poem_jax.geometry.triangulation import MIN_BASELINE, triangulate
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT
 from poem_jax.models import network
-from poem_jax.models.config import Config
+from poem_jax.models.config import GridDraw, ModelConfig
 from poem_jax.models.layers import NormMode
 from poem_jax.models.presets import V2_BASE
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame, is_traced
-from poem_jax.typing import Array, Float, Num, Params, PRNGKeyArray
+from poem_jax.typing import Array, Bool, Float, Int, Num, Params, PRNGKeyArray
 
 _PARALLEL = 1e-2
 """Radians. Rays that differ by less are called parallel in messages."""
 
 
-def init(config: Config, *, key: PRNGKeyArray) -> Params:
-    """Return fresh parameters: `trainable`, `statistics`, and `constants` (basis, template, hand).
+def init(config: ModelConfig, *, key: PRNGKeyArray) -> Params:
+    """Return fresh parameters: `trainable`, `statistics`, and `constants` (hand, template, basis, ...).
 
     The weights are drawn by NumPy with a seed from `key`, since that compiles nothing. Under `jit` or `vmap`
     JAX draws them: other numbers of the same distribution, and a minute of compiling for a large model.
@@ -41,8 +41,10 @@ def apply(
     views: Num[Array, "batch view h w 3"],
     cams: Cameras,
     *,
-    config: Config | None = None,
+    config: ModelConfig | None = None,
     root_world: Float[Array, "batch 3"] | None = None,
+    ball_index: Int[Array, "batch point"] | None = None,
+    key: PRNGKeyArray | None = None,
 ) -> Prediction:
     """Reconstruct one hand per sample from its valid views.
 
@@ -64,33 +66,48 @@ def apply(
         cams: intrinsics of these images, extrinsics from any world frame, `view_mask`.
         config: the configuration that `params` were made with; None = `v2-base`.
         root_world: joint 9 in metres where it is known; needed by samples with one view. A row of NaN is
-            unknown: that sample's root is triangulated, as all are for None.
+            unknown: that sample's root is triangulated, as all are for None. Only for systems whose config
+            `takes_root`.
+        ball_index: for systems that draw basis points from the grids before the cameras
+            (`config.grid_draw`): which points each sample reads, as numbers in its grid (view, w, h, depth),
+            flattened. None = drawn with `key`.
+        key: for the same systems, one JAX key; None = key 0. Unused where `ball_index` is given.
 
-    Returns: the prediction in the world frame of `cams`. Under a trace, a sample that cannot be solved has
-    `valid` False and finite numbers.
+    Returns: the prediction in the world frame of `cams`; what the system does not have is None there. Under a
+    trace, a sample that cannot be solved has `valid` False and finite numbers.
 
     Raises:
-        ValueError: `params` of another config, inputs that are concrete and wrong, or concrete samples whose
-            cameras and images do not determine where the hand is.
+        ValueError: `params` of another config, inputs that are concrete and wrong or that the system does not
+            take, a number of views that it cannot take, or concrete samples whose cameras and images do not
+            determine where the hand is.
     """
     config = V2_BASE if config is None else config
     network.check_params(config, params)
-    check_inputs(views, cams, root_world, config)
+    check_inputs(views, cams, root_world, config, ball_index, key)
     frame = enter_working_frame(views, cams, root_world, network.number_type(params))
-    prediction = _predict(params, views, frame, config=config)
-    check_solved(prediction, frame)
+    draw = network.Draw.of(config, ball_index, key)
+    prediction = _predict(params, views, frame, draw, config=config)
+    check_solved(prediction, frame, config)
     return prediction
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _predict(params: Params, views: Array, frame: WorkingFrame, *, config: Config) -> Prediction:
-    return network.reconstruct(network.assemble(config, params), views, frame, NormMode())
+def _predict(
+    params: Params, views: Array, frame: WorkingFrame, draw: network.Draw, *, config: ModelConfig
+) -> Prediction:
+    return network.reconstruct(network.assemble(config, params), views, frame, NormMode(), draw)
 
 
-def check_inputs(views: Any, cams: Any, root_world: Any, config: Config) -> None:
+def check_inputs(
+    views: Any, cams: Any, root_world: Any, config: ModelConfig, ball_index: Any = None, key: Any = None
+) -> None:
     """Raise `ValueError` that says what, expected, got and fix; the arguments are those of `apply`."""
+    _check_taken(config, root_world=root_world, ball_index=ball_index, key=key)
     _check_types(views, cams, root_world)
     _check_views(views, config)
+    check_view_count(config, views.shape[1])
+    if ball_index is not None and config.grid_draw is not None:
+        _check_ball_index(ball_index, len(views), views.shape[1], config.grid_draw)
     if np.shape(cams.K) != (*views.shape[:2], 3, 3):
         raise ValueError(
             f"`cams.K` must have shape (batch, view, 3, 3) = {(*views.shape[:2], 3, 3)}, as `views` says; "
@@ -101,8 +118,61 @@ def check_inputs(views: Any, cams: Any, root_world: Any, config: Config) -> None
         _check_root(np.asarray(root_world))
     check_cameras(cams, config.image_hw, root_world)
     if not traced:
-        _check_view_counts(cams, root_world)
+        _check_view_counts(cams, root_world, config)
         _check_float_images(views, np.asarray(cams.view_mask))
+
+
+def check_view_count(config: ModelConfig, num_views: int, name: str = "`views`") -> None:
+    """Raise `ValueError` for a padded number of views that a system cannot take; `name` is what has them."""
+    least, most = config.view_range
+    if num_views < least or (most is not None and num_views > most):
+        wanted = f"{least}" if least == most else f"{least} to {most}"
+        raise ValueError(
+            f"{name} must have {wanted} views, as the layers of this {type(config).__name__} are made for; "
+            f"got {num_views}. Leave views out, pad with masked ones, or take a model for {num_views}"
+        )
+
+
+def _check_taken(config: ModelConfig, *, root_world: Any, ball_index: Any, key: Any) -> None:
+    """Refuse arguments that a system has no use for."""
+    system = type(config).__name__
+    if root_world is not None and not config.takes_root:
+        raise ValueError(
+            f"`root_world` must be None for this {system}, which has no use for a known root; leave it out"
+        )
+    for name, value in (("ball_index", ball_index), ("key", key)):
+        if value is not None and config.grid_draw is None:
+            raise ValueError(
+                f"`{name}` must be None for this {system}, which draws no points from the cameras' grids; "
+                "leave it out"
+            )
+    if key is not None and not _is_one_key(key):
+        raise ValueError(f"`key` must be one key of `jax.random`; got {key!r}")
+
+
+def _is_one_key(key: Any) -> bool:
+    """Whether this is a key of `jax.random.key`, or one of the older `jax.random.PRNGKey`."""
+    if not isinstance(key, jax.Array):
+        return False
+    typed = jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return key.shape == () if typed else key.dtype == np.uint32 and key.ndim == 1
+
+
+def _check_ball_index(ball_index: Any, batch: int, num_views: int, draw: GridDraw) -> None:
+    shape, wanted, size = np.shape(ball_index), (batch, draw.num_points), num_views * draw.points_per_view
+    if not isinstance(ball_index, np.ndarray | jax.Array) or not np.issubdtype(ball_index.dtype, np.integer):
+        kind = getattr(ball_index, "dtype", type(ball_index).__name__)
+        raise ValueError(f"`ball_index` must be an array of whole numbers; got {kind}. Convert it to int32")
+    if shape != wanted:
+        raise ValueError(f"`ball_index` must have shape (batch, point) = {wanted}; got {shape}")
+    if is_traced(ball_index):
+        return
+    low, high = int(np.min(ball_index)), int(np.max(ball_index))
+    if low < 0 or high >= size:
+        raise ValueError(
+            f"`ball_index` must number the {size} grid points of {num_views} views, 0 to {size - 1}; got "
+            f"{low} to {high}. Number them in the order (view, w, h, depth), with padded views counted"
+        )
 
 
 def _check_types(views: Any, cams: Any, root_world: Any) -> None:
@@ -122,7 +192,7 @@ def _check_types(views: Any, cams: Any, root_world: Any) -> None:
             )
 
 
-def _check_views(views: Array, config: Config) -> None:
+def _check_views(views: Array, config: ModelConfig) -> None:
     shape = np.shape(views)
     if len(shape) != 5 or shape[2:] != (*config.image_hw, 3):
         raise ValueError(
@@ -135,8 +205,8 @@ def _check_views(views: Array, config: Config) -> None:
         raise ValueError(f"`views` must be uint8, or float in [0, 1]; got {views.dtype}")
 
 
-def _check_view_counts(cams: Cameras, root_world: Array | None) -> None:
-    """A root that is not known needs two cameras at different places."""
+def _check_view_counts(cams: Cameras, root_world: Array | None, config: ModelConfig) -> None:
+    """A root that is not known needs two cameras at different places, if the system triangulates one."""
     mask = np.asarray(cams.view_mask)
     counts = mask.sum(-1)
     if (counts == 0).any():
@@ -144,12 +214,16 @@ def _check_view_counts(cams: Cameras, root_world: Array | None) -> None:
             f"every sample needs at least one valid view; `cams.view_mask` of samples {_where(counts == 0)} "
             "is all False. Drop these samples."
         )
+    if not config.triangulates:
+        return
+    root_or = "`root_world` of shape (batch, 3), or " if config.takes_root else ""
     unknown = np.isnan(np.full((len(mask), 3), np.nan) if root_world is None else root_world).any(-1)
     lost = (counts == 1) & unknown
     if lost.any():
+        needs = "`root_world`" if config.takes_root else "another"
         raise ValueError(
-            f"a sample with one valid view needs `root_world`, since one view does not fix the root; samples "
-            f"{_where(lost)} have one, and no root. Give `root_world` of shape (batch, 3), or another view."
+            f"a sample with one valid view needs {needs}, since one view does not fix the root; samples "
+            f"{_where(lost)} have one, and no root. Give {root_or}another view."
         )
     centre = invert_rigid(fill_masked_views(Cameras(*map(np.asarray, cams))).T_cam_from_world)[..., :3, 3]
     apart = np.where(mask[..., None], centre - centre[np.arange(len(mask)), mask.argmax(-1)][:, None], 0)
@@ -158,7 +232,7 @@ def _check_view_counts(cams: Cameras, root_world: Array | None) -> None:
         raise ValueError(
             "cameras at one place do not fix how far the hand is; in samples "
             f"{_where(lost)} all valid views stand within {MIN_BASELINE} m. Give each view its own "
-            "`T_cam_from_world`, or `root_world`"
+            f"`T_cam_from_world`{', or `root_world`' if config.takes_root else ''}"
         )
 
 
@@ -196,24 +270,54 @@ def _where(condition: np.ndarray) -> list:
     )
 
 
-def check_solved(prediction: Prediction, frame: WorkingFrame) -> None:
-    """Raise `ValueError` that names the samples whose root is neither known nor determined, and why."""
+def check_solved(prediction: Prediction, frame: WorkingFrame, config: ModelConfig) -> None:
+    """Raise `ValueError` that names the samples that have no answer, and says why."""
     if is_traced(prediction.valid, frame) or np.asarray(prediction.valid).all():
         return
     lost = ~np.asarray(prediction.valid)
+    if config.triangulates:
+        _check_rays(prediction, frame, config, lost)
+    if config.grid_draw is not None:
+        raise ValueError(
+            f"points of the cameras' grids must lie in the ball about the hand; in samples {_where(lost)} "
+            "none does. Check that all views see the hand, at distances that the grids reach, and that "
+            "`T_cam_from_world` is in metres"
+        )
+    raise ValueError(f"samples {_where(lost)} have no answer: their views determine none")
+
+
+def _check_rays(
+    prediction: Prediction, frame: WorkingFrame, config: ModelConfig, lost: Bool[np.ndarray, " batch"]
+) -> None:
+    """Raise unless the rays of all lost samples meet before their cameras."""
+    assert prediction.keypoints_px is not None
+    root_or = "`root_world`, or " if config.takes_root else ""
     joint = ROOT_JOINT if prediction.keypoints_px.shape[2] == NUM_JOINTS else 0
-    angle = _widest_angle(frame.cams, np.asarray(prediction.keypoints_px, np.float64)[:, :, joint])
+    uv_px = np.asarray(prediction.keypoints_px, np.float64)[:, :, joint]
+    angle = _widest_angle(frame.cams, uv_px)
     if (angle[lost] < _PARALLEL).all():
         raise ValueError(
             f"the views must see the hand from different directions to fix its distance; in samples "
             f"{_where(lost)} all rays to the root are parallel, to {angle[lost].max():.2g} rad. Give "
-            "`root_world`, or a view from another side"
+            f"{root_or}a view from another side"
         )
+    meets = lost & _rays_meet(frame.cams, uv_px)
+    if config.grid_draw is not None and (meets == lost).all():
+        return
+    lost = lost & ~meets if (lost & ~meets).any() else lost
     raise ValueError(
         f"the views must look at one hand; in samples {_where(lost)} the rays to its root meet behind a "
         "camera, or nowhere. Check that images and cameras are in the same order and that "
-        "`T_cam_from_world` maps world to camera, or give `root_world`"
+        f"`T_cam_from_world` maps world to camera{', or give `root_world`' if config.takes_root else ''}"
     )
+
+
+def _rays_meet(cams: Cameras, uv_px: Float[np.ndarray, "batch view 2"]) -> Bool[np.ndarray, " batch"]:
+    """Whether the rays through one pixel of each view meet before every camera."""
+    K, T_cam_from_primary, mask = (np.asarray(leaf) for leaf in cams)
+    points, solved = triangulate(uv_px[:, :, None], K, T_cam_from_primary, mask=mask[..., None])
+    _, depth = project(K, T_cam_from_primary, np.asarray(points)[:, None])
+    return np.asarray(solved)[:, 0] & ((depth[..., 0] > 0) | ~mask).all(1)
 
 
 def _widest_angle(cams: Cameras, uv_px: Float[np.ndarray, "batch view 2"]) -> Float[np.ndarray, " batch"]:

@@ -1,7 +1,8 @@
-"""Configuration of a POEM model: frozen dataclasses nested by owner.
+"""Configuration of the models: what every system's says, `ModelConfig`, and that of POEM v2, `Config`.
 
-Where the paper and the released models differ in a whole part, the part names its `Design`; single choices
-are fields of the part that has them. Cross-field rules are checked on construction.
+Frozen dataclasses nested by owner; the other systems have a file each for theirs. Where the paper and the
+released models differ in a whole part, the part names its `Design`; single choices are fields of the part
+that has them. Cross-field rules are checked on construction.
 """
 
 import enum
@@ -381,9 +382,9 @@ class ModelConfig:
         return None
 
     @property
-    def required_views(self) -> int | None:
-        """The one number of views that the layers are made for, all of them valid; None = any number."""
-        return None
+    def view_range(self) -> tuple[int, int | None]:
+        """Least and most views that the layers are made for, masked ones counted; None = any number."""
+        return 1, None
 
     @property
     def couples_samples(self) -> bool:
@@ -393,7 +394,7 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class Config(ModelConfig):
-    """A whole model."""
+    """A whole POEM v2 model."""
 
     image_hw: tuple[int, int] = (256, 256)
     image_mean: float = 0.5
@@ -462,3 +463,18 @@ class Config(ModelConfig):
             self.decoder.first_queries is FirstQueries.TEMPLATE or self.root.num_joints == NUM_JOINTS,
             f"`first_queries` = joints needs `root.num_joints` = {NUM_JOINTS}; got {self.root.num_joints}",
         )
+
+    @property
+    def query_order(self) -> QueryOrder:
+        """Layout of the 799 query points."""
+        return self.decoder.query_order
+
+    @property
+    def triangulates(self) -> bool:
+        """The root, at least, is triangulated."""
+        return True
+
+    @property
+    def takes_root(self) -> bool:
+        """A known root stands in for the triangulated one."""
+        return True

@@ -14,7 +14,7 @@ import numpy as np
 from flax import nnx
 
 from poem_jax.geometry.transforms import matmul, rotation_from_6d, smallest_rotation, transpose
-from poem_jax.hand.model import HandMesh, HandModel, PosedHand, hand_mesh
+from poem_jax.hand.model import HandMesh, HandModel, PosedHand
 from poem_jax.hand.topology import (
     NUM_QUERIES,
     NUM_SHAPES,
@@ -39,15 +39,6 @@ _SMALL = 1e-2
 """Scale of the first weights: training starts near the flat mean hand."""
 _MAX_JOINT_DISTANCE = 1.5
 """Basis radii. Triangulated joints farther from the root are drawn in before they pose the template."""
-
-
-def template_queries(
-    hand: HandModel, order: QueryOrder, *, center_joint: int = ROOT_JOINT
-) -> Float[Array, "799 3"]:
-    """Return the flat mean hand about its root joint, or another (OpenPose order), metres."""
-    dtype = hand.v_template.dtype
-    zero_pose, mean_shape = np.zeros((NUM_SKELETON_JOINTS, 3), dtype), np.zeros(NUM_SHAPES, dtype)
-    return join_queries(*hand_mesh(hand, zero_pose, mean_shape, center_joint=center_joint), order)
 
 
 def pose_by_joints(

@@ -16,7 +16,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,36 +27,36 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.io.compiler_options import cpu_options
 from poem_jax.models import network
 from poem_jax.models.apply import check_inputs, check_solved
-from poem_jax.models.config import Config
-from poem_jax.models.decoder import Surroundings
+from poem_jax.models.config import ModelConfig
 from poem_jax.models.layers import NormMode
-from poem_jax.models.network import ViewFeatures
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame, is_traced
-from poem_jax.typing import Array, Float, Num, Params
+from poem_jax.typing import Array, Float, Int, Num, Params, PRNGKeyArray, PyTree
 
 _VIEWS_AT_A_TIME = 8
 """Views that an accelerator takes at a time."""
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=["params", "first"], meta_fields=["config"])
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["params", "constant"], meta_fields=["config"]
+)
 @dataclass(frozen=True)
 class Prepared:
     """A model ready for inference: its parameters, and what does not depend on the images."""
 
     params: Params
-    first: Surroundings | None
-    """Whom the first decoder layer reads, and what the offsets contribute; None where samples differ."""
-    config: Config
+    constant: dict[str, PyTree] | None
+    """Arguments of `find_hands` that do not depend on the images, if the system has any."""
+    config: ModelConfig
 
 
-def prepare(params: Params, config: Config) -> Prepared:
+def prepare(params: Params, config: ModelConfig) -> Prepared:
     """Check the parameters and compute what is constant in them.
 
     Raises:
         ValueError: `params` of another config.
     """
     network.check_params(config, params)
-    return jax.device_put(Prepared(params, _first_surroundings(params, config), config))
+    return jax.device_put(Prepared(params, _constant(params, config), config))
 
 
 def infer(
@@ -65,21 +65,24 @@ def infer(
     cams: Cameras,
     *,
     root_world: Float[Array, "batch 3"] | None = None,
+    ball_index: Int[Array, "batch point"] | None = None,
+    key: PRNGKeyArray | None = None,
 ) -> Prediction:
     """Do what `apply` does, faster: the same arguments, results and errors, for concrete inputs only.
 
     Not pure: it looks at `cams.view_mask` to skip the views that are not there. `heat_maps` and
-    `keypoints_px` of masked views are zero.
+    `keypoints_px` of masked views, where the system has them, are zero.
 
     Raises:
         ValueError: as `apply`, and traced inputs.
     """
-    if is_traced(views, cams, root_world):
+    if is_traced(views, cams, root_world, ball_index, key):
         raise ValueError("`infer` looks at the values of its inputs; under jit, grad or vmap use `apply`")
-    check_inputs(views, cams, root_world, prepared.config)
+    check_inputs(views, cams, root_world, prepared.config, ball_index, key)
     frame = _frame(prepared, views, cams, root_world)
-    prediction = _infer_in_frame(prepared, views, frame)
-    check_solved(prediction, frame)
+    draw = network.Draw.of(prepared.config, ball_index, key)
+    prediction = _infer_in_frame(prepared, views, frame, draw)
+    check_solved(prediction, frame, prepared.config)
     return prediction
 
 
@@ -89,13 +92,16 @@ def infer_unchecked(
     cams: Cameras,
     *,
     root_world: Float[Array, "batch 3"] | None = None,
+    ball_index: Int[Array, "batch point"] | None = None,
+    key: PRNGKeyArray | None = None,
 ) -> Prediction:
     """Do what `infer` does without its checks: a sample that cannot be solved has `valid` False.
 
     A view that is masked, or whose image or camera is not finite, is left out. On a CPU a sample without any
     view costs nothing and is zero.
     """
-    return _infer_in_frame(prepared, views, _frame(prepared, views, cams, root_world))
+    draw = network.Draw.of(prepared.config, ball_index, key)
+    return _infer_in_frame(prepared, views, _frame(prepared, views, cams, root_world), draw)
 
 
 def _frame(prepared: Prepared, views: Array, cams: Cameras, root_world: Array | None) -> WorkingFrame:
@@ -103,12 +109,12 @@ def _frame(prepared: Prepared, views: Array, cams: Cameras, root_world: Array | 
     return enter_working_frame(*concrete, network.number_type(prepared.params))
 
 
-def _infer_in_frame(prepared: Prepared, views: Array, frame: WorkingFrame) -> Prediction:
+def _infer_in_frame(prepared: Prepared, views: Array, frame: WorkingFrame, draw: network.Draw) -> Prediction:
     seen = _look_at_valid(prepared, np.asarray(views), frame.cams.view_mask)
-    return _find_hands(prepared, seen, frame)
+    return _find_hands(prepared, _Samples(seen, frame, draw.ball_index), draw.key)
 
 
-def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> ViewFeatures:
+def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> PyTree:
     """Run the trunk over the valid views, chunk by chunk; masked views get zeros."""
     packed = views[valid]
     chunk = 1 if _on_cpu() else _VIEWS_AT_A_TIME
@@ -122,16 +128,28 @@ def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> 
     return _read(buffers, place)
 
 
-def _find_hands(prepared: Prepared, seen: ViewFeatures, frame: WorkingFrame) -> Prediction:
-    """Run the second half: on accelerators the whole batch at once, on a CPU sample by sample."""
-    samples = (seen, frame)
+class _Samples(NamedTuple):
+    """What the second half needs of each sample."""
+
+    seen: Any
+    """The features of its views."""
+    frame: WorkingFrame
+    ball_index: Int[Array, "batch point"] | None
+
+
+def _find_hands(prepared: Prepared, samples: _Samples, key: PRNGKeyArray | None) -> Prediction:
+    """Run the second half: on accelerators the whole batch at once, on a CPU sample by sample, unless they
+    depend on each other."""
     if not _on_cpu():
-        return _find(prepared, samples)
-    rows = np.flatnonzero(frame.cams.view_mask.any(-1)) if frame.cams.view_mask.any() else np.array([0])
-    parts = [jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], samples) for row in rows]
+        return _find(prepared, (samples, key))
+    if prepared.config.couples_samples:
+        return _run_all(_find, prepared, [(samples, key)])[0]
+    mask = samples.frame.cams.view_mask
+    rows = np.flatnonzero(mask.any(-1)) if mask.any() else np.array([0])
+    parts = [(jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], samples), key) for row in rows]
     found = dict(zip(rows.tolist(), _run_all(_find, prepared, parts), strict=True))
     empty = jax.tree.map(jnp.zeros_like, found[int(rows[0])])
-    ordered = [found.get(row, empty) for row in range(len(frame.known_root))]
+    ordered = [found.get(row, empty) for row in range(len(mask))]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ordered)
 
 
@@ -185,14 +203,16 @@ def _on_cpu() -> bool:
 
 
 @jax.jit
-def _look(prepared: Prepared, views: Array) -> ViewFeatures:
+def _look(prepared: Prepared, views: Array) -> PyTree:
     return network.assemble(prepared.config, prepared.params).look(views, NormMode())
 
 
 @jax.jit
-def _find(prepared: Prepared, samples: tuple[ViewFeatures, WorkingFrame]) -> Prediction:
+def _find(prepared: Prepared, given: tuple[_Samples, PRNGKeyArray | None]) -> Prediction:
+    (seen, frame, ball_index), key = given
     model = network.assemble(prepared.config, prepared.params)
-    return model.find_hands(*samples, NormMode(), prepared.first)
+    draw = network.Draw(ball_index, key)
+    return model.find_hands(seen, frame, NormMode(), **(prepared.constant or {}), **draw.arguments())
 
 
 @functools.cache
@@ -203,26 +223,27 @@ def _cpu_program(function: Callable, one_thread: bool) -> Callable:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _first_surroundings(params: Params, config: Config) -> Surroundings | None:
-    return network.assemble(config, params).prepared_surroundings()
+def _constant(params: Params, config: ModelConfig) -> dict[str, PyTree] | None:
+    model = network.assemble(config, params)
+    return model.prepared() if isinstance(model, network.Prepares) else None
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
-def _empty_features(prepared: Prepared, image_dtype: np.dtype, count: int) -> ViewFeatures:
+def _empty_features(prepared: Prepared, image_dtype: np.dtype, count: int) -> PyTree:
     image = jax.ShapeDtypeStruct((1, *prepared.config.image_hw, 3), image_dtype)
     shapes = jax.eval_shape(_look, prepared, image)
     return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), shapes)
 
 
 @functools.partial(jax.jit, donate_argnums=0)
-def _write(buffers: ViewFeatures, seen: ViewFeatures, start: Array) -> ViewFeatures:
+def _write(buffers: PyTree, seen: PyTree, start: Array) -> PyTree:
     return jax.tree.map(
         lambda buffer, part: jax.lax.dynamic_update_slice_in_dim(buffer, part, start, 0), buffers, seen
     )
 
 
 @jax.jit
-def _read(buffers: ViewFeatures, place: Array) -> ViewFeatures:
+def _read(buffers: PyTree, place: Array) -> PyTree:
     """Take the rows of the valid views; the row behind the last view is nobody's."""
 
     def rows(buffer: Array) -> Array:

@@ -5,7 +5,15 @@ import math
 from dataclasses import dataclass, field, replace
 
 from poem_jax.hand.topology import QueryOrder
-from poem_jax.models.config import CropConfig, Design, ResNetConfig, require, require_counts
+from poem_jax.models.config import (
+    CropConfig,
+    Design,
+    FrozenNorms,
+    ModelConfig,
+    ResNetConfig,
+    require,
+    require_counts,
+)
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import (
     DEXYCB_CUBOID,
@@ -34,15 +42,15 @@ class CanonicalFusion:
     num_points: int = 32
     """Points per cell of the map: a third of its channels."""
     num_views: int = 8
-    """Most views of a sample in the paper's design, whose last convolution has weights for each. The release's
-    takes any number."""
+    """Most views of a sample in the paper's design, whose last convolution has weights for each. The
+    release's design takes any number."""
 
     def __post_init__(self) -> None:
         require_counts(self, "num_points", "num_views")
 
 
 @dataclass(frozen=True)
-class MeshTransformerConfig:
+class MeshTransformerConfig(ModelConfig):
     """A whole mesh transformer."""
 
     design: Design = Design.PAPER
@@ -82,8 +90,8 @@ class MeshTransformerConfig:
         )
         require(
             self.design is Design.PAPER or self.stride == strides[-1],
-            "`backbone` must end at `stride` with `design` = release, which reads nothing coarser; got strides "
-            f"{strides} and `stride` = {self.stride}",
+            "`backbone` must end at `stride` with `design` = release, which reads nothing coarser; got the "
+            f"strides {strides} and `stride` = {self.stride}",
         )
         require(self.width % 4 == 0, f"`width` must be a multiple of 4; got {self.width}")
         require(
@@ -103,6 +111,13 @@ class MeshTransformerConfig:
         """Layout of the 799 queries."""
         return QueryOrder.JOINTS_FIRST if self.design is Design.RELEASE else QueryOrder.VERTICES_FIRST
 
+    @property
+    def view_range(self) -> tuple[int, int | None]:
+        """The paper's canonical fusion has weights for each view; the others take any number."""
+        if isinstance(self.fusion, CanonicalFusion) and self.design is Design.PAPER:
+            return 1, self.fusion.num_views
+        return 1, None
+
 
 PE_MESHTR = MeshTransformerConfig(fusion=PositionEmbeddedFusion())
 FTL_MESHTR = MeshTransformerConfig(fusion=CanonicalFusion())
@@ -120,7 +135,7 @@ def pe_meshtr_release(dataset: str = "dexycb") -> MeshTransformerConfig:
         design=Design.RELEASE,
         fusion=PositionEmbeddedFusion(frustum),
         # What lies behind stage 2 reaches no output and is left out.
-        backbone=replace(ResNetConfig.resnet34(), blocks=(3, 4), channels=(64, 128)),
+        backbone=replace(ResNetConfig.resnet34(FrozenNorms.STAGE_STARTS), blocks=(3, 4), channels=(64, 128)),
         cuboid=cuboid,
     )
 

@@ -1,5 +1,5 @@
-"""PE-MeshTR and FTL-MeshTR, the paper's own baselines: image tokens of all views, told where they stand, and a
-decoder whose 799 embeddings read them and become points (paper, section "Main experiments").
+"""PE-MeshTR and FTL-MeshTR, the paper's own baselines: image tokens of all views, told where they stand, and
+a decoder whose 799 embeddings read them and become points (paper, section "Main experiments").
 
     views -> trunk -> map at 1/8, d channels -> [fusion] -> tokens of all views
     query codes (799, d) -> DETR's decoder, which reads the tokens -> network of three layers, shared by all
@@ -17,13 +17,16 @@ There is no first stage and no root: points are regressed where they are. Paper 
     start      the middle of the cuboid                    the learned points, through a sigmoid
     order      [V, J]                                      [J, V]
 
-Where the paper says nothing, the release is followed: 6 layers of 8 heads, 2048 hidden channels, dropout 0.1,
-the norm and the network after the decoder, 32 points of FTL. And decided here, for the paper's models: the map
-is POEM's own (trunk and up-sampling branch, 1x1 convolution to d); the grid has D = 32 depths of linearly
-increasing steps, as POEM v1's; FTL's tokens get the release's code of view, row and column in their keys,
-since DETR's decoder needs to know where a token stands and canonical features do not say it; the query
-embeddings are the paper's `E_X` alone, METRO's template not among them, since the section says so of both
-models; what they become is a share of the cuboid that the ablation of one stage names.
+Where the paper says nothing, the release is followed: 6 layers of 8 heads, 2048 hidden channels, dropout
+0.1, the norm and the network after the decoder, 32 points of FTL. And decided here, for the paper's models:
+
+- the map is POEM's own: trunk and up-sampling branch to 1/8, 1 x 1 convolution to d;
+- the grid has D = 32 depths of linearly increasing steps, as POEM v1's, on rays through the cells' centres;
+- FTL's tokens have the release's code of view, row and column in their keys: DETR's decoder has to know where
+  a token stands, and canonical features do not say it;
+- FTL's fusing convolution is 1 x 1, without a norm;
+- the query embeddings are the paper's `E_X` alone, without METRO's template: the section says so of both;
+- points are shares of the cuboid that the ablation of one stage names, starting from its middle.
 """
 
 from typing import NamedTuple
@@ -36,11 +39,10 @@ from flax import nnx
 from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, invert_intrinsics
 from poem_jax.geometry.transforms import invert_rigid, matmul, transform_points
-from poem_jax.hand.model import HandModel
-from poem_jax.hand.topology import NUM_QUERIES, WRIST, QueryOrder
+from poem_jax.hand.model import HandModel, template_queries
+from poem_jax.hand.topology import NUM_QUERIES, WRIST
 from poem_jax.models.backbones import ResNet
 from poem_jax.models.config import Design
-from poem_jax.models.constants import HandConstants
 from poem_jax.models.detr import DetrDecoder
 from poem_jax.models.frustum import (
     denormalised,
@@ -51,13 +53,13 @@ from poem_jax.models.frustum import (
     sigmoid_step,
     view_row_column_code,
 )
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.layers import Conv, ConvNorm, NormMode, TopDownBranch, linear, normal, uniform
 from poem_jax.models.mesh_transformer_config import (
     CanonicalFusion,
     MeshTransformerConfig,
     PositionEmbeddedFusion,
 )
+from poem_jax.models.network import HandConstants
 from poem_jax.models.point_features import valid_views_first
 from poem_jax.models.world_frame import Reconstruction, WorkingFrame, leave_working_frame
 from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
@@ -197,9 +199,9 @@ class EmbeddedPositions(nnx.Module):
 def grid_point_code(shares: Float[Array, "*batch 3"], width: int) -> Float[Array, "*batch c"]:
     """Encode points, given as shares of their space, by `width` / 2 sines, each followed by its cosine.
 
-    Of waves 2 pi x, 2 pi y, 2 pi z, then of twice the frequencies, and so on, until the channels are full; the
-    paper says "a series of sinusoids" of no more. Frequencies rise, since points of one hand lie within a
-    tenth of the space.
+    Of waves 2 pi x, 2 pi y, 2 pi z, then of twice the frequencies, and so on, until the channels are full:
+    the paper says no more than "a series of sinusoids". Frequencies rise, since points of one hand lie within
+    a tenth of the space.
     """
     wave = np.arange(width // 2)
     angle = shares[..., wave % 3] * jnp.asarray(2 * np.pi * 2.0 ** (wave // 3), shares.dtype)
@@ -244,17 +246,8 @@ class CanonicalMaps(nnx.Module):
         self.place_code = PlaceCode(self.width, rngs=rngs)
 
     def __call__(self, maps: Float[Array, "batch view h w c"], cams: Cameras, mode: NormMode) -> Tokens:
-        """Return the tokens.
-
-        Raises:
-            ValueError: more views than the convolution has weights for.
-        """
+        """Return the tokens; `config.view_range` says how many views there may be."""
         batch, view, h, w, _ = maps.shape
-        if view > self.num_views:
-            raise ValueError(
-                f"`views` must hold at most {self.num_views} views, as many as the model fuses; got {view}. "
-                "Leave views out, or train a model with more `fusion.num_views`"
-            )
         points = _per_image(self.to_points, maps, mode).reshape(batch, view, -1, 3)
         moved = transform_points(invert_rigid(cams.T_cam_from_world), points).reshape(batch, view, h, w, -1)
         canonical, cams = valid_views_first(moved, cams)
@@ -274,8 +267,8 @@ class CanonicalMaps(nnx.Module):
 
 
 class PixelUnitMaps(nnx.Module):
-    """Canonical fusion of the release, view by view: a convolution; points by K^-1 T^-1; a convolution; points
-    by K T, into pixel units of the same camera, undivided by depth; a convolution.
+    """Canonical fusion of the release, view by view: a convolution; points by K^-1 T^-1; a convolution;
+    points by K T, into pixel units of the same camera, undivided by depth; a convolution.
 
     T^-1 goes from the camera to the primary one. Nothing of another view enters before the decoder. Keys are
     told view, row and column, as in `EncodedPositions`.
@@ -380,8 +373,8 @@ class EmbeddedQueries(nnx.Module):
 
 
 class ReferenceQueries(nnx.Module):
-    """Learned points; what tells queries apart are the points' sines, and for PE-MeshTR the hand template,
-    mixed by a network (release)."""
+    """Learned points; what tells queries apart are the points' sines, and for PE-MeshTR the hand template
+    about its wrist, mixed by a network (release)."""
 
     def __init__(self, config: MeshTransformerConfig, *, rngs: nnx.Rngs) -> None:
         self.axis_width, self.order = config.width // 2, config.query_order
@@ -396,13 +389,8 @@ class ReferenceQueries(nnx.Module):
         points = self.points[...]
         code = point_sine_code(points, self.axis_width)
         if self.with_template:
-            code = jnp.concatenate([code, wrist_template(hand, self.order)], -1)
+            code = jnp.concatenate([code, template_queries(hand, self.order, center_joint=WRIST)], -1)
         return Queries(self.out(jax.nn.relu(self.hidden(code))), jax.nn.sigmoid(points))
-
-
-def wrist_template(hand: HandModel, order: QueryOrder) -> Float[Array, "799 3"]:
-    """Return the flat mean hand about its wrist, metres."""
-    return template_queries(hand, order, center_joint=WRIST)
 
 
 class OffsetNetwork(nnx.Module):

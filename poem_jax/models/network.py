@@ -1,11 +1,13 @@
-"""The POEM v2 network as one module, and its parameters as a plain pytree.
+"""Any system as one module, and its parameters as a plain pytree.
 
-The way through the network is one: enter the working frame, `Poem.look` at every view, `Poem.find_hands` in
-what was seen, leave the working frame. `forward` does it at once; `infer.py` looks view by view.
+The way through a model is one: enter the working frame, `look` at every view, `find_hands` in what was seen,
+leave the working frame. `forward` does it at once; `infer.py` looks view by view. Which module belongs to a
+config is said in `systems.py`.
 """
 
 import functools
-from typing import Any, NamedTuple
+import importlib
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -13,38 +15,14 @@ import numpy as np
 from flax import nnx
 
 from poem_jax.batch import Prediction
-from poem_jax.geometry.cameras import Cameras, primary_view
-from poem_jax.geometry.neighbours import farthest_points
+from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.template import default_hand
-from poem_jax.hand.topology import join_queries
-from poem_jax.models.aggregation import ProjectiveAggregation
-from poem_jax.models.backbones import HRNet, ResNet
-from poem_jax.models.config import Config, DecoderOutput, Design, FirstQueries, HRNetConfig
-from poem_jax.models.decoder import Decoder, Surroundings
-from poem_jax.models.hand_output import (
-    ParameterRegressor,
-    first_queries,
-    root_relative_mesh,
-    template_queries,
-)
-from poem_jax.models.heat_maps import HeatMapBranch, root_point, triangulate_joints
+from poem_jax.models.config import ModelConfig
 from poem_jax.models.layers import NormMode
-from poem_jax.models.point_features import (
-    FeatureBranch,
-    basis_points,
-    projected_features,
-    sine_code,
-    valid_views_first,
-)
-from poem_jax.models.vector_attention import Neighbours
-from poem_jax.models.world_frame import (
-    Reconstruction,
-    WorkingFrame,
-    enter_working_frame,
-    leave_working_frame,
-)
-from poem_jax.typing import Array, Float, Num, Params, PRNGKeyArray
+from poem_jax.models.systems import MODULES
+from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
+from poem_jax.typing import Array, Float, Int, Num, Params, PRNGKeyArray, PyTree
 
 _MAX_SHOWN = 3
 """Mismatches that an error lists."""
@@ -81,15 +59,6 @@ GROUPS = {"trainable": nnx.Param, "statistics": nnx.BatchStat, "constants": Cons
 """Which kind of variable each part of `params` holds."""
 
 
-class ViewFeatures(NamedTuple):
-    """What is computed of every view alone; leading axes (image,) or (batch, view)."""
-
-    keypoints_px: Float[Array, "*batch joint 2"]
-    heat_maps: Float[Array, "*batch joint h w"]
-    feature_maps: Float[Array, "*batch h w c"]
-    """Without the release's position code, which depends on the other views."""
-
-
 class HandConstants(nnx.Module):
     """The hand model's arrays, stored with the weights."""
 
@@ -102,133 +71,58 @@ class HandConstants(nnx.Module):
         return HandModel(*(getattr(self, name)[...] for name in HandModel._fields))
 
 
-class AnchorConstants(nnx.Module):
-    """The rows that every query reads in the first layer, and their positions in basis radii.
+@runtime_checkable
+class System(Protocol):
+    """What every system's `nnx.Module` has."""
 
-    They spread over the template: each is the point farthest from those before it, from point 0 on.
-    """
+    config: Any
+    hand: HandConstants
 
-    def __init__(self, config: Config, template: Float[np.ndarray, "799 3"]) -> None:
-        index = farthest_points(template, config.decoder.num_neighbours)
-        self.index = Constant(index)
-        self.positions = Constant(np.asarray(template[index] / config.basis.radius, np.float32))
+    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> Any:
+        """Do everything that is done with every view alone.
 
-    def surroundings(self) -> Surroundings:
-        """Let all queries of all samples (batch 1) read these rows, of queries and basis alike."""
-        index, positions = (jnp.asarray(leaf[...])[:, None, None] for leaf in (self.index, self.positions))
-        near = Neighbours(index, positions)
-        return Surroundings(near, near)
+        Returns: a NamedTuple of arrays, their leading axes those of the views.
+        """
+        ...
 
-
-class Poem(nnx.Module):
-    """POEM v2 (paper, figure "Model architecture")."""
-
-    def __init__(self, config: Config, hand: HandModel, *, rngs: nnx.Rngs) -> None:
-        self.config = config
-        trunk = config.backbone
-        self.trunk = (HRNet if isinstance(trunk, HRNetConfig) else ResNet)(trunk, rngs=rngs)  # pyright: ignore[reportArgumentType]
-        self.heat_maps = HeatMapBranch(config.root, trunk, rngs=rngs)
-        self.features = FeatureBranch(config, rngs=rngs)
-        self.aggregation = ProjectiveAggregation(config.aggregation, config.width, rngs=rngs)
-        self.decoder = Decoder(config.decoder, config.width, rngs=rngs)
-        parametric = config.decoder.output is DecoderOutput.HAND_PARAMETERS
-        is_release = config.decoder.layer is Design.RELEASE
-        self.regressor = (
-            ParameterRegressor(config.width, row_major=is_release, rngs=rngs) if parametric else None
-        )
-        self.basis_points = Constant(jnp.asarray(basis_points(config.basis)))
-        template = template_queries(hand, config.decoder.query_order)
-        self.template_queries = Constant(jnp.asarray(template))
-        self.anchors = AnchorConstants(config, template) if is_release else None
-        self.hand = HandConstants(hand)
-
-    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
-        """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
-        levels = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
-        keypoints_px, heat_maps = self.heat_maps(levels, mode)
-        seen = ViewFeatures(keypoints_px, heat_maps, self.features(levels, heat_maps, mode))
-        return ViewFeatures(*(leaf.reshape(*views.shape[:-3], *leaf.shape[1:]) for leaf in seen))
-
-    def find_hands(
-        self,
-        seen: ViewFeatures,
-        frame: WorkingFrame,
-        mode: NormMode,
-        first: Surroundings | None = None,
-        dropout_key: PRNGKeyArray | None = None,
-    ) -> Prediction:
+    def find_hands(self, seen: Any, frame: WorkingFrame, mode: NormMode, **rest: Any) -> Prediction:
         """Join what was seen in the views (batch, view) to one hand per sample, in the user's world.
 
-        `first`: whom the first decoder layer reads, if it was prepared.
+        `rest`: `dropout_key` in training; of systems whose config has a `grid_draw` also `ball_index` and
+        `key` (`Draw`); and what the module's own `prepared` gave.
         """
-        cams, config, radius = frame.cams, self.config, self.config.basis.radius
-        reference_joints, solved = triangulate_joints(config.root, seen.keypoints_px, seen.heat_maps, cams)
-        # In training the first stage learns from its own loss alone: rays that nearly coincide would send
-        # wild gradients through the triangulation.
-        joints = jax.lax.stop_gradient(reference_joints) if mode.training else reference_joints
-        root, valid = root_point(joints, solved, frame.known_root, cams.view_mask)
+        ...
 
-        basis_features = self._read_views(seen.feature_maps, cams, root)
-        start = self._start(joints - root[:, None], jnp.all(solved, -1))
-        first = self.first_surroundings() if first is None else first
-        moved, embeddings = self.decoder(
-            start / radius, self.basis_points[...] / radius, basis_features, first, dropout_key
-        )
 
-        hand, layers, parameters = self.hand.model(), [radius * queries for queries in moved], None
-        if self.regressor is not None:
-            parameters = self.regressor(embeddings)
-            layers.append(join_queries(*root_relative_mesh(hand, parameters), config.decoder.query_order))
-        found = Reconstruction(
-            seen.keypoints_px,
-            seen.heat_maps,
-            reference_joints,
-            root,
-            valid,
-            jnp.stack(layers, 1) + root[:, None, None],
-            parameters,
-        )
-        return leave_working_frame(found, frame, hand, config.decoder.query_order)
+@runtime_checkable
+class Prepares(Protocol):
+    """A system of which something does not depend on the images."""
 
-    def first_surroundings(self) -> Surroundings | None:
-        """Return whom the first decoder layer reads (batch 1), None where that depends on the sample."""
-        return None if self.anchors is None else self.anchors.surroundings()
+    def prepared(self) -> dict[str, PyTree]:
+        """Return arguments of `find_hands` that can be computed once."""
+        ...
 
-    def prepared_surroundings(self) -> Surroundings | None:
-        """Return the same with all that is constant in it computed."""
-        first = self.first_surroundings()
-        if first is None or self.config.decoder.first_queries is not FirstQueries.TEMPLATE:
-            return first
-        start = self.template_queries[...] / self.config.basis.radius
-        return self.decoder.layers[0].with_deltas(start[None], first)  # pyright: ignore[reportAttributeAccessIssue]
 
-    def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.basis_points[...].dtype) / scale
-        return (images - self.config.image_mean) / self.config.image_std
+class Draw(NamedTuple):
+    """Which points of the cameras' grids become basis points; both None = the system draws none."""
 
-    def _read_views(
-        self, feature_maps: Float[Array, "batch view h w c"], cams: Cameras, root: Float[Array, "batch 3"]
-    ) -> Float[Array, "batch basis c"]:
-        """Return the features of the basis points about `root`, fused over the views."""
-        by_paper = self.config.features.design is Design.PAPER
-        feature_maps = self.features.with_position(feature_maps, cams.view_mask)
-        if self.config.aggregation.design is Design.RELEASE:
-            feature_maps, cams = valid_views_first(feature_maps, cams)
-        basis = root[:, None] + self.basis_points[...]
-        sampled, uv_share = projected_features(
-            feature_maps, cams, basis, self.config.image_hw, zeros_behind=by_paper
-        )
-        if by_paper:
-            sampled = sampled + sine_code(uv_share, sampled.shape[-1])
-        return self.aggregation(sampled, cams.view_mask, primary_view(cams.view_mask))
+    ball_index: Int[Array, "batch point"] | None = None
+    """Numbers in the grid (view, w, h, depth) of each sample, flattened; None = drawn."""
+    key: PRNGKeyArray | None = None
+    """What they are drawn with."""
 
-    def _start(self, joints: Array, solved: Array) -> Float[Array, "batch query 3"]:
-        """Return the query points before the first layer, metres about the root."""
-        template, order = self.template_queries[...], self.config.decoder.query_order
-        if self.config.decoder.first_queries is FirstQueries.TEMPLATE:
-            return jnp.broadcast_to(template, (joints.shape[0], *template.shape))
-        return first_queries(self.hand.model(), template, joints, solved, self.config.basis.radius, order)
+    @classmethod
+    def of(cls, config: ModelConfig, ball_index: Array | None, key: PRNGKeyArray | None) -> "Draw":
+        """Return what a system needs: nothing, or the indices, or a key, by default key 0."""
+        if config.grid_draw is None:
+            return cls()
+        if ball_index is not None:
+            return cls(jnp.asarray(ball_index, jnp.int32))
+        return cls(None, jax.random.key(0) if key is None else key)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of `find_hands` that it stands for."""
+        return {} if self.ball_index is None and self.key is None else self._asdict()
 
 
 def forward(
@@ -236,10 +130,12 @@ def forward(
     views: Num[Array, "batch view h w 3"],
     cams: Cameras,
     *,
-    config: Config,
+    config: ModelConfig,
     root_world: Float[Array, "batch 3"] | None = None,
     train: bool = False,
     key: PRNGKeyArray | None = None,
+    ball_index: Int[Array, "batch point"] | None = None,
+    draw_key: PRNGKeyArray | None = None,
     axis_name: str | None = None,
 ) -> tuple[Prediction, dict]:
     """Do what `apply` does without its checks, and return the batch-norm statistics too.
@@ -252,6 +148,8 @@ def forward(
         root_world: as in `apply`, in training the noisy true root; NaN rows are triangulated.
         train: normalise by the moments of this batch's valid views and move the running statistics.
         key: in training, what dropout draws from; None = nothing is dropped.
+        ball_index: as in `apply`.
+        draw_key: the `key` of `apply`.
         axis_name: device axis over which the moments are averaged.
 
     Returns: the prediction, and the new `params["statistics"]` (unchanged unless `train`).
@@ -259,25 +157,28 @@ def forward(
     frame = enter_working_frame(views, cams, root_world, number_type(params))
     model = assemble(config, params)
     mode = NormMode(frame.cams.view_mask.reshape(-1) if train else None, axis_name)
-    prediction = reconstruct(model, views, frame, mode, key if train else None)
+    draw = Draw.of(config, ball_index, draw_key)
+    prediction = reconstruct(model, views, frame, mode, draw, key if train else None)
     return prediction, statistics(model) if train else params["statistics"]
 
 
 def reconstruct(
-    model: Poem,
+    model: System,
     views: Num[Array, "batch view h w 3"],
     frame: WorkingFrame,
     mode: NormMode,
+    draw: Draw,
     dropout_key: PRNGKeyArray | None = None,
 ) -> Prediction:
     """Reconstruct one hand per sample in the user's world, from within the working frame."""
     shown = jnp.where(frame.cams.view_mask[..., None, None, None], views, 0)
-    return model.find_hands(model.look(shown, mode), frame, mode, dropout_key=dropout_key)
+    seen = model.look(shown, mode)
+    return model.find_hands(seen, frame, mode, dropout_key=dropout_key, **draw.arguments())
 
 
 def number_type(params: Params) -> Any:
     """Return the number type in which a model computes."""
-    return params["constants"]["basis_points"].dtype
+    return params["constants"]["hand"]["v_template"].dtype
 
 
 class _Blueprint(NamedTuple):
@@ -285,12 +186,26 @@ class _Blueprint(NamedTuple):
     states: dict[str, dict[tuple, Any]]
 
 
-def build(config: Config, rngs: nnx.Rngs) -> Poem:
-    """Make a model with fresh weights and the shipped hand."""
-    return Poem(config, default_hand(), rngs=rngs)
+def build(config: ModelConfig, rngs: nnx.Rngs, hand: HandModel | None = None) -> System:
+    """Make a model with fresh weights and the shipped hand, or another."""
+    file, name = _home(config).split(":")
+    module = getattr(importlib.import_module(file), name)
+    return module(config, default_hand() if hand is None else hand, rngs=rngs)
 
 
-def split(model: Poem) -> Params:
+def constants_of(config: ModelConfig, hand: HandModel) -> dict[str, Any]:
+    """Return the constants of a model with a certain hand, as in `params["constants"]`."""
+    return split(build(config, nnx.Rngs(0), hand))["constants"]
+
+
+def _home(config: ModelConfig) -> str:
+    if type(config) not in MODULES:
+        known = ", ".join(sorted(kind.__name__ for kind in MODULES))
+        raise ValueError(f"`config` must be of one of the classes {known}; got {type(config).__name__}")
+    return MODULES[type(config)]
+
+
+def split(model: System) -> Params:
     """Return the model's arrays."""
     params = {group: _nested(nnx.to_flat_state(nnx.state(model, kind))) for group, kind in GROUPS.items()}
     return with_static_indices(params)
@@ -311,12 +226,12 @@ def leaves_with_names(tree: Any) -> dict[str, Array]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def statistics(model: Poem) -> dict[str, Any]:
+def statistics(model: System) -> dict[str, Any]:
     """Return the batch-norm statistics alone, as in `params["statistics"]`."""
     return _nested(nnx.to_flat_state(nnx.state(model, nnx.BatchStat)))
 
 
-def assemble(config: Config, params: Params) -> Poem:
+def assemble(config: ModelConfig, params: Params) -> System:
     """Return the model that holds the arrays of `params`."""
     blueprint = _blueprint(config)
     states = [
@@ -328,13 +243,13 @@ def assemble(config: Config, params: Params) -> Poem:
     return nnx.merge(blueprint.graph, *states)
 
 
-def describe(config: Config) -> Params:
+def describe(config: ModelConfig) -> Params:
     """Return the shapes and dtypes that `init` would give, without computing anything."""
     states = _blueprint(config).states
     return {group: _nested(flat.items()) for group, flat in states.items()}
 
 
-def check_params(config: Config, params: Params) -> None:
+def check_params(config: ModelConfig, params: Params) -> None:
     """Raise `ValueError` unless `params` has the paths and shapes of `config`."""
     expected, got = _shapes(describe(config)), _shapes(params)
     if expected == got:
@@ -360,7 +275,7 @@ class _SameKey(nnx.Rngs):
 
 
 @functools.lru_cache(maxsize=32)
-def _blueprint(config: Config) -> _Blueprint:
+def _blueprint(config: ModelConfig) -> _Blueprint:
     abstract = nnx.eval_shape(lambda key: build(config, _SameKey(key)), jax.random.key(0))
     graph, *states = nnx.split(abstract, *GROUPS.values())
     return _Blueprint(graph, {g: dict(nnx.to_flat_state(s)) for g, s in zip(GROUPS, states, strict=True)})

@@ -30,22 +30,21 @@ from flax import nnx
 
 from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, primary_view
-from poem_jax.hand.model import HandModel
+from poem_jax.hand.model import HandModel, template_queries
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import ResNet
 from poem_jax.models.ball_query import draw_ball, points_at, repeated
 from poem_jax.models.config import AggregationConfig, Design, RootConfig
-from poem_jax.models.constants import Constant, HandConstants
 from poem_jax.models.decoder import PAPER_EPSILON, MultiHeadAttention, OffsetNetwork
 from poem_jax.models.detr import DetrDecoder
 from poem_jax.models.frustum import frustum_grid
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.heat_maps import HeatMapBranch
 from poem_jax.models.layers import Conv, NormMode, TopDownBranch, layer_norm, linear, normal
 from poem_jax.models.mesh_transformer_config import MeshTransformerConfig, PositionEmbeddedFusion
 from poem_jax.models.mesh_transformers import EmbeddedPositions
 from poem_jax.models.mesh_transformers import OffsetNetwork as MeshOffsetNetwork
+from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.poem_v1_config import (
     BasisFeatures,
     PoemV1Config,
@@ -165,7 +164,7 @@ class PoemV1(nnx.Module):
 
     def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
         scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.hand.v_template[...].dtype) / scale
+        images = jnp.asarray(views, self.hand.model().v_template.dtype) / scale
         return (images - self.config.image_mean) / self.config.image_std
 
 

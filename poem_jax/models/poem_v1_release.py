@@ -22,10 +22,9 @@ from flax import nnx
 from poem_jax.geometry.cameras import Cameras, primary_view
 from poem_jax.geometry.sampling import sample_bilinear
 from poem_jax.geometry.transforms import matmul, transform_points, transpose
-from poem_jax.hand.model import HandModel
+from poem_jax.hand.model import HandModel, template_queries
 from poem_jax.hand.topology import NUM_QUERIES, WRIST
 from poem_jax.models.ball_query import points_at
-from poem_jax.models.constants import Constant
 from poem_jax.models.decoder import OffsetNetwork
 from poem_jax.models.frustum import (
     denormalised,
@@ -35,8 +34,8 @@ from poem_jax.models.frustum import (
     sigmoid_step,
 )
 from poem_jax.models.frustum_config import Cuboid
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.layers import Conv, NormMode, TopDownBranch, linear, max_pool, uniform
+from poem_jax.models.network import Constant
 from poem_jax.models.poem_v1_config import (
     BasisFeatures,
     PoemV1Config,

@@ -4,8 +4,14 @@
 `v2-large-release`, `v2-medium-mano-release` those that the authors released, for their weights; `v2-nano` is
 the paper's structure (the template first, sigmoid maps of the release's 21 joints, nearest points anew in
 every layer, the primary view's similarities) on a small trunk; `tiny`, on the same trunk, is ours, for a CPU.
+
+`v1` and its ablations `v1-1stage`, `v1-wo-proj`, `v1-wo-pt`, `v1-g-emb`, `v1-gv-emb`, and the baselines
+`pe-meshtr`, `ftl-meshtr` and `mvp` are the paper's. The authors released `v1-release-dexycb` and so on, of
+three data sets, and `pe-meshtr-release`, `ftl-meshtr-release`, `mvp-release`, here of DexYCB; `released`
+gives every released model of every data set.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from poem_jax.hand.topology import NUM_JOINTS
@@ -19,13 +25,33 @@ from poem_jax.models.config import (
     Design,
     FeatureConfig,
     FirstQueries,
+    FrozenNorms,
     HeatActivation,
+    ModelConfig,
     ResNetConfig,
     RootConfig,
     Similarity,
     Stem,
     ViewWeights,
 )
+from poem_jax.models.frustum_config import DEXYCB_CUBOID, HO3D_CUBOID, OAKINK_CUBOID
+from poem_jax.models.mesh_transformer_config import (
+    FTL_MESHTR,
+    PE_MESHTR,
+    ftl_meshtr_release,
+    pe_meshtr_release,
+)
+from poem_jax.models.mvp_config import MvpConfig
+from poem_jax.models.poem_v1_config import (
+    V1,
+    BasisFeatures,
+    OneStageConfig,
+    PoemV1Config,
+    QueryEmbedding,
+    TokenDecoderConfig,
+)
+from poem_jax.models.poem_v1_config import one_stage as v1_one_stage
+from poem_jax.models.poem_v1_config import released as released_v1
 
 V2_BASE = Config()
 V2_SMALL = replace(V2_BASE, width=128)
@@ -84,7 +110,43 @@ V2_NANO = Config(
     basis=BasisConfig(num_points=2048),
 )
 
-PRESETS = {
+CUBOIDS = {"dexycb": DEXYCB_CUBOID, "ho3d": HO3D_CUBOID, "oakink": OAKINK_CUBOID}
+"""Where hands are in the data sets that models of POEM v1 and its baselines were released for."""
+DATASETS = tuple(CUBOIDS)
+_RELEASED_EMBEDDINGS = {
+    "v1": QueryEmbedding.VERTEX,
+    "v1-g-emb": QueryEmbedding.GLOBAL,
+    "v1-gv-emb": QueryEmbedding.GLOBAL_AND_VERTEX,
+    "v1-full-emb": QueryEmbedding.POINTS,
+}
+
+
+def _released_mvp(dataset: str, num_views: int) -> MvpConfig:
+    trunk = ResNetConfig.resnet34(FrozenNorms.STAGE_STARTS)
+    return MvpConfig(design=Design.RELEASE, num_views=num_views, backbone=trunk, cuboid=CUBOIDS[dataset])
+
+
+def _released_v1(embedding: QueryEmbedding) -> Callable[[str, int], PoemV1Config]:
+    return lambda dataset, num_views: released_v1(CUBOIDS[dataset], embedding)
+
+
+def _released_v2(variant: str) -> Callable[[str, int], ModelConfig]:
+    return lambda dataset, num_views: preset(f"{variant}-release")
+
+
+RELEASED: dict[str, Callable[[str, int], ModelConfig]] = {
+    **{name: _released_v2(name) for name in ("v2-small", "v2-medium", "v2-large", "v2-medium-mano")},
+    **{name: _released_v1(embedding) for name, embedding in _RELEASED_EMBEDDINGS.items()},
+    "v1-wo-proj": lambda dataset, num_views: released_v1(
+        CUBOIDS[dataset], QueryEmbedding.POINT_CODES, BasisFeatures.OWN_CAMERA
+    ),
+    "pe-meshtr": lambda dataset, num_views: pe_meshtr_release(dataset),
+    "ftl-meshtr": lambda dataset, num_views: ftl_meshtr_release(dataset),
+    "mvp": _released_mvp,
+}
+"""How to make the config of each released model, of a data set and a number of views."""
+
+PRESETS: dict[str, ModelConfig] = {
     "v2-small": V2_SMALL,
     "v2-base": V2_BASE,
     "v2-large": V2_LARGE,
@@ -95,10 +157,23 @@ PRESETS = {
     "v2-medium-mano-release": V2_MEDIUM_MANO_RELEASE,
     "v2-nano": V2_NANO,
     "tiny": TINY,
+    "v1": V1,
+    "v1-1stage": v1_one_stage(OneStageConfig().origin),
+    "v1-wo-proj": replace(V1, basis_features=BasisFeatures.OWN_CAMERA),
+    "v1-wo-pt": replace(V1, decoder=TokenDecoderConfig()),
+    "v1-g-emb": replace(V1, query_embedding=QueryEmbedding.GLOBAL),
+    "v1-gv-emb": replace(V1, query_embedding=QueryEmbedding.GLOBAL_AND_VERTEX),
+    **{f"v1-release-{dataset}": released_v1(cuboid) for dataset, cuboid in CUBOIDS.items()},
+    "pe-meshtr": PE_MESHTR,
+    "pe-meshtr-release": pe_meshtr_release(),
+    "ftl-meshtr": FTL_MESHTR,
+    "ftl-meshtr-release": ftl_meshtr_release(),
+    "mvp": MvpConfig(),
+    "mvp-release": _released_mvp("dexycb", 8),
 }
 
 
-def preset(name: str) -> Config:
+def preset(name: str) -> ModelConfig:
     """Return the configuration of a named model.
 
     Raises:
@@ -107,3 +182,22 @@ def preset(name: str) -> Config:
     if name not in PRESETS:
         raise ValueError(f"`name` must be one of {sorted(PRESETS)}; got {name!r}")
     return PRESETS[name]
+
+
+def released(variant: str, *, dataset: str = "dexycb", num_views: int = 8) -> ModelConfig:
+    """Return the configuration of a released model.
+
+    Args:
+        variant: one of `RELEASED`.
+        dataset: one of `DATASETS`: of POEM v1 and the baselines, what it was trained on; of no account for
+            POEM v2.
+        num_views: views that the layers of MvP are made for; of no account for the others.
+
+    Raises:
+        ValueError: no such variant or data set.
+    """
+    if variant not in RELEASED:
+        raise ValueError(f"`variant` must be one of {', '.join(RELEASED)}; got {variant!r}")
+    if dataset not in DATASETS:
+        raise ValueError(f"`dataset` must be one of {', '.join(DATASETS)}; got {dataset!r}")
+    return RELEASED[variant](dataset, num_views)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from poem_jax.losses import PAPER, LossRecipe
-from poem_jax.models.config import Config, require
+from poem_jax.models.config import ModelConfig, require
 from poem_jax.synthetic.config import SyntheticConfig
 
 
@@ -195,7 +195,7 @@ class TrainConfig:
     """A whole experiment."""
 
     name: str
-    model: Config
+    model: ModelConfig
     data: DataConfig = DataConfig()
     loss: LossRecipe = PAPER
     first_stage_steps: int = 0
@@ -219,6 +219,19 @@ class TrainConfig:
         require(
             not self.model.crop.upright,
             "`model.crop.upright` is for models of upright hands; the synthetic captures are not turned",
+        )
+        require(
+            not self.first_stage_steps or self.model.triangulates,
+            f"`first_stage_steps` must be 0 for a {type(self.model).__name__} without a first stage; "
+            f"got {self.first_stage_steps}",
+        )
+        least, most = self.model.view_range
+        counts = {shape.num_views for shape in self.data.batches}
+        counts |= set(run.validation_views) if run.validate_every else set()
+        require(
+            all(least <= n <= (most or n) for n in counts),
+            f"this {type(self.model).__name__} is made for {least} to {most} views, in `data.batches` and "
+            f"`train.validation_views` alike; got {sorted(counts)}",
         )
         max_views = max(shape.num_views for shape in self.data.batches)
         require(

@@ -74,7 +74,7 @@ def _one_schedule(options: OptimizerConfig, peak: float, steps: int) -> optax.Sc
     if options.schedule is Schedule.COSINE:
         main = optax.cosine_decay_schedule(peak, max(steps - warmup, 1), options.final_ratio)
     elif options.schedule is Schedule.STEP:
-        main = optax.piecewise_constant_schedule(peak, {max(int(steps * options.drop_at) - warmup, 0): 0.1})
+        main = optax.piecewise_constant_schedule(peak, {max(round(steps * options.drop_at) - warmup, 0): 0.1})
     else:
         main = optax.constant_schedule(peak)
     if not warmup:

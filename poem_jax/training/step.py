@@ -53,8 +53,11 @@ def train_step(
         The next state, and scalar metrics of this step, equal on all devices.
     """
     noise_key, model_key = jax.random.split(jax.random.fold_in(key, state.step))
-    root_world = noisy_root(batch.joints_world, config.training_root, key=noise_key, axis_name=axis_name)
-    if config.training_root.source is RootSource.TRIANGULATED:
+    draw_key = jax.random.fold_in(model_key, 1) if config.model.grid_draw else None
+    root_world = None
+    if config.model.takes_root:
+        root_world = noisy_root(batch.joints_world, config.training_root, key=noise_key, axis_name=axis_name)
+    if root_world is not None and config.training_root.source is RootSource.TRIANGULATED:
         # A root that is NaN is triangulated; one view alone cannot do it.
         several = jnp.sum(batch.cameras.view_mask, -1) > 1
         root_world = jnp.where(several[:, None], jnp.nan, root_world)
@@ -73,6 +76,7 @@ def train_step(
             root_world=root_world,
             train=True,
             key=model_key,
+            draw_key=draw_key,
             axis_name=axis_name,
         )
         image_hw = batch.views.shape[-3:-1]
@@ -89,7 +93,7 @@ def train_step(
                 hand=hand,
                 image_hw=image_hw,
                 recipe=config.loss,
-                query_order=config.model.decoder.query_order,
+                query_order=config.model.query_order,
                 axis_name=axis_name,
             )
             errors = error_metrics(prediction, batch, axis_name=axis_name)
@@ -137,8 +141,11 @@ def noisy_root(
 def near_the_hand(prediction: Prediction, batch: MultiViewBatch) -> Prediction:
     """Mark samples as unsolved whose root went so far astray that no basis point lies on the hand.
 
-    Their second stage sees nothing of the hand and could only learn the mean.
+    Their second stage sees nothing of the hand and could only learn the mean. A model without a root keeps
+    all.
     """
+    if prediction.root_world is None:
+        return prediction
     root = batch.joints_world[:, ROOT_JOINT]
     near = _distance(prediction.root_world, root) < MAX_ROOT_ERROR_M
     return prediction._replace(valid=prediction.valid & near)
@@ -157,9 +164,12 @@ def error_metrics(prediction: Prediction, batch: MultiViewBatch, *, axis_name: s
 
 
 def keypoint_error(prediction: Prediction, batch: MultiViewBatch, *, axis_name: str | None = None) -> Metrics:
-    """Compute the heat maps' mean error in pixels, a share as in `error_metrics`."""
+    """Compute the heat maps' mean error in pixels, a share as in `error_metrics`; nothing without heat
+    maps."""
+    if prediction.keypoints_px is None:
+        return {}
     view_mask, _ = valid_masks(prediction, batch)
-    distance = _distance(prediction.keypoints_px, match_keypoints(prediction, batch))
+    distance = _distance(prediction.keypoints_px, match_keypoints(prediction.keypoints_px, batch))
     return {"keypoint_px": masked_mean(distance, view_mask, axis_name=axis_name)}
 
 

@@ -30,8 +30,8 @@ class Validation:
         )
 
     def __call__(self, state: TrainState) -> dict[str, float]:
-        """Return by view count the mean and median vertex error, the root's error, and the vertex error with
-        the true root given, in millimetres."""
+        """Return by view count the mean and median vertex error, the root's error where the model has one,
+        and where it takes one the vertex error with the true root given; millimetres."""
         metrics: dict[str, float] = {}
         params = evaluation_params(state)
         for num_views, batches in self.batches.items():
@@ -47,18 +47,21 @@ class Validation:
         root_true = batch.joints_world[:, ROOT_JOINT]
         placed = put_batch(batch._replace(root_world=root_true), self.mesh)
         found, given = self.predict(params, placed.views, placed.cameras, placed.root_world)
-        return {
-            "mpvpe_mm": _distance_mm(found.vertices_world, batch.vertices_world).mean(-1),
-            "root_mm": _distance_mm(found.root_world, root_true),
-            "true_root_mpvpe_mm": _distance_mm(given.vertices_world, batch.vertices_world).mean(-1),
-        }
+        errors = {"mpvpe_mm": _distance_mm(found.vertices_world, batch.vertices_world).mean(-1)}
+        if found.root_world is not None:
+            errors["root_mm"] = _distance_mm(found.root_world, root_true)
+        if given is not None:
+            errors["true_root_mpvpe_mm"] = _distance_mm(given.vertices_world, batch.vertices_world).mean(-1)
+        return errors
 
 
 def _predict(
     params: Params, views: Array, cameras: Array, root_world: Array, *, config: TrainConfig
-) -> tuple[Prediction, Prediction]:
-    """Reconstruct with the triangulated root and with the true one."""
+) -> tuple[Prediction, Prediction | None]:
+    """Reconstruct with the triangulated root and, where the model takes one, with the true one."""
     found = apply(params, views, cameras, config=config.model)
+    if not config.model.takes_root:
+        return found, None
     given = apply(params, views, cameras, config=config.model, root_world=root_world)
     return found, given
 

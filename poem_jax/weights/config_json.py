@@ -1,6 +1,7 @@
 """The JSON form of a model's configuration, saved beside every checkpoint.
 
-Unknown keys, missing kinds and values of another type fail; an absent key takes its default.
+A whole config carries the class name of its system as `kind`; without one it is POEM v2's. Unknown keys,
+missing kinds and values of another type fail; an absent key takes its default.
 """
 
 import dataclasses
@@ -11,7 +12,8 @@ import typing
 from typing import Any, TypeVar
 
 from poem_jax.io.json_file import parse_json
-from poem_jax.models.config import Config, require
+from poem_jax.models.config import Config, ModelConfig, require
+from poem_jax.models.systems import MODULES
 
 _T = TypeVar("_T")
 _KIND = "kind"
@@ -48,12 +50,15 @@ _ONE_BY_ONE = {
 the paper's and in the release's."""
 
 
-def to_json(config: Config) -> str:
-    """Write a config as JSON text; dataclasses that are one of several carry their class name as `kind`."""
-    return json.dumps(_encode(config, Config), indent=2)
+def to_json(config: ModelConfig) -> str:
+    """Write a config as JSON text; dataclasses that are one of several carry their class name as `kind`, but
+    for POEM v2's whole config."""
+    kind = type(config)
+    said = {} if kind is Config else {_KIND: kind.__name__}
+    return json.dumps({**said, **_encode(config, kind)}, indent=2)
 
 
-def from_json(text: str) -> Config:
+def from_json(text: str) -> ModelConfig:
     """Read a config from JSON text.
 
     Raises:
@@ -63,9 +68,11 @@ def from_json(text: str) -> Config:
     return from_values(parse_json(text, "the config"))
 
 
-def from_values(values: Any) -> Config:
+def from_values(values: Any) -> ModelConfig:
     """Read a config from the values of its JSON form; errors as in `from_json`."""
-    return _decode(_of_today(values) if isinstance(values, dict) else values, Config, "config")
+    if not isinstance(values, dict) or _KIND not in values:
+        return _decode(_of_today(values) if isinstance(values, dict) else values, Config, "config")
+    return _decode_one_of(values, tuple(MODULES), "config")
 
 
 def _of_today(values: dict[str, Any]) -> dict[str, Any]:
@@ -116,7 +123,7 @@ def _encode(value: Any, declared: Any) -> Any:
     if dataclasses.is_dataclass(value):
         hints = typing.get_type_hints(type(value))
         entries = {f.name: _encode(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
-        return {_KIND: type(value).__name__, **entries} if _is_union(declared) else entries
+        return {_KIND: type(value).__name__, **entries} if _is_choice(declared) else entries
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -149,8 +156,19 @@ def _decode_tuple(value: Any, entries: tuple[Any, ...], path: str) -> tuple[Any,
 
 
 def _decode_union(value: Any, declared: Any, path: str) -> Any:
+    options = typing.get_args(declared)
+    if value is None and types.NoneType in options:
+        return None
+    dataclass_options = tuple(option for option in options if dataclasses.is_dataclass(option))
+    if len(dataclass_options) == len(options):
+        return _decode_one_of(value, options, path)
+    (declared,) = (option for option in options if option is not types.NoneType)
+    return _decode(value, declared, path)
+
+
+def _decode_one_of(value: Any, classes: tuple[type, ...], path: str) -> Any:
     require(isinstance(value, dict), f"`{path}` must be an object; got {_short(value)}")
-    options = {option.__name__: option for option in typing.get_args(declared)}
+    options = {option.__name__: option for option in classes}
     kind = value.get(_KIND)
     if not isinstance(kind, str) or kind not in options:
         raise ValueError(f"`{path}.{_KIND}` must be one of {sorted(options)}; got {_short(kind)}")
@@ -164,6 +182,11 @@ def _decode_dataclass(value: Any, declared: type[_T], path: str) -> _T:
     if unknown:
         raise ValueError(f"`{path}` has unknown keys {_short(unknown)}; known are {sorted(hints)}")
     return declared(**{key: _decode(entry, hints[key], f"{path}.{key}") for key, entry in value.items()})
+
+
+def _is_choice(declared: Any) -> bool:
+    """Whether a value may be of one of several dataclasses."""
+    return _is_union(declared) and types.NoneType not in typing.get_args(declared)
 
 
 def _is_union(declared: Any) -> bool:

@@ -14,12 +14,11 @@ from poem_jax.hand import mano_file
 from poem_jax.hand.model import HandModel
 from poem_jax.io.npz_file import read_npy
 from poem_jax.io.torch_file import load_state_dict, save_state_dict
-from poem_jax.models.config import Config
-from poem_jax.models.presets import preset
+from poem_jax.models.config import Config, ModelConfig
+from poem_jax.models.presets import released
 from poem_jax.typing import Float, Int
 from poem_jax.weights import store
-from poem_jax.weights.release_keys import hand_prefixes, used_rows
-from poem_jax.weights.torch_import import VARIANTS, check_anchors, convert, export_state_dict
+from poem_jax.weights.torch_import import check_anchors, convert, export_state_dict, names_of
 
 BASIS_FILE, ANCHOR_FILE, INDEX_FILE = "bps.npy", "anchor.npy", "anchor_idx.npy"
 _READ_OF_A_HAND = set(HandModel._fields) - {"faces", "is_left"}
@@ -51,8 +50,10 @@ def import_release(
     variant: str,
     *,
     mano: str | Path,
-    assets: str | Path,
     out: str | Path,
+    assets: str | Path | None = None,
+    dataset: str = "dexycb",
+    num_views: int = 8,
     accept_anchors: bool = False,
     overwrite: bool = False,
 ) -> Imported:
@@ -62,8 +63,10 @@ def import_release(
         checkpoint: the `.pth.tar`; nothing in it is run.
         variant: one of `torch_import.VARIANTS`.
         mano: `MANO_RIGHT.pkl`, or an `.npz` with MANO's names.
-        assets: folder with `bps.npy`, `anchor.npy`, `anchor_idx.npy`.
         out: folder to make; on failure nothing is left there, and what stood there stays.
+        assets: folder with `bps.npy`, `anchor.npy`, `anchor_idx.npy`; POEM v2 alone, and needed there.
+        dataset: as in `convert`.
+        num_views: as in `convert`.
         accept_anchors: take anchors that do not lie on the template of `mano` and of the checkpoint.
         overwrite: replace the model folder at `out`.
 
@@ -71,14 +74,13 @@ def import_release(
         FileNotFoundError: a file is missing.
         ValueError: files that are damaged, hostile or do not belong together, or `out` exists.
     """
-    if variant not in VARIANTS:
-        raise ValueError(f"`variant` must be one of {', '.join(VARIANTS)}; got {variant!r}")
-    out, config = Path(out), preset(f"{variant}-release")
+    out, config = Path(out), released(variant, dataset=dataset, num_views=num_views)
     _check_folder(out, overwrite)
-    hand, constants = mano_file.load(mano), read_assets(assets, config)
+    hand, constants = mano_file.load(mano), _assets(assets, config, variant)
     state = load_state_dict(checkpoint)
-    _, params = convert(state, variant, mano=hand, **constants._asdict())
-    if not accept_anchors:
+    model_of = {"dataset": dataset, "num_views": num_views}
+    _, params = convert(state, variant, mano=hand, **constants, **model_of)
+    if isinstance(config, Config) and not accept_anchors:
         check_anchors(config, params, hand)
     store.save(out, config, params, overwrite=overwrite)
     num_read = _num_read(state, config)
@@ -110,6 +112,16 @@ def export_release(model: str | Path, out: str | Path, *, overwrite: bool = Fals
     state = export_state_dict(*store.load(model))
     save_state_dict(out, state)
     return len(state)
+
+
+def _assets(folder: str | Path | None, config: ModelConfig, variant: str) -> dict[str, np.ndarray]:
+    """Return the constants that `convert` needs beside a checkpoint of this model."""
+    if isinstance(config, Config) == (folder is None):
+        wanted = (
+            "needs the folder `assets` of the authors' repository" if folder is None else "has no `assets`"
+        )
+        raise ValueError(f"{variant} {wanted}; {'give' if folder is None else 'leave out'} --assets")
+    return {} if folder is None or not isinstance(config, Config) else read_assets(folder, config)._asdict()
 
 
 def read_assets(folder: str | Path, config: Config) -> Assets:
@@ -162,9 +174,10 @@ def _check_folder(out: Path, overwrite: bool) -> None:
         )
 
 
-def _num_read(names: Iterable[str], config: Config) -> int:
+def _num_read(found: Iterable[str], config: ModelConfig) -> int:
     """Count the names of a state dict whose arrays `convert` uses."""
-    used = {row.source for row in used_rows(config)}
-    hands = [prefix for prefix, is_used in hand_prefixes(config).items() if is_used]
+    names = names_of(config)
+    used = {row.source for row in names.rows}
+    hands = [prefix for prefix, is_used in names.hands.items() if is_used]
     used |= {f"{prefix}th_{field}" for prefix in hands for field in _READ_OF_A_HAND}
-    return sum(name.removeprefix("module.") in used for name in names)
+    return sum(name.removeprefix("module.") in used for name in found)

@@ -18,7 +18,7 @@ from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.io.json_file import read_json
-from poem_jax.models.config import Config
+from poem_jax.models.config import ModelConfig
 from poem_jax.models.network import StaticArray, describe, leaves_with_names, with_static_indices
 from poem_jax.typing import Array, Params, PyTree
 from poem_jax.weights.config_json import from_values, to_json
@@ -31,7 +31,12 @@ SHIPPED = Path(__file__).parent / "tiny"
 
 
 def save(
-    path: str | os.PathLike, config: Config, params: Params, *, dtype: Any = None, overwrite: bool = False
+    path: str | os.PathLike,
+    config: ModelConfig,
+    params: Params,
+    *,
+    dtype: Any = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a model: its config as JSON and its parameters as an Orbax checkpoint.
 
@@ -83,7 +88,7 @@ def _put_in_place(new: Path, path: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load(path: str | os.PathLike, *, expected: Config | None = None) -> tuple[Config, Params]:
+def load(path: str | os.PathLike, *, expected: ModelConfig | None = None) -> tuple[ModelConfig, Params]:
     """Read a model that `save` wrote.
 
     Args:
@@ -113,7 +118,7 @@ def load(path: str | os.PathLike, *, expected: Config | None = None) -> tuple[Co
     return config, with_static_indices(unflatten(leaves, describe(config)))
 
 
-def shipped() -> tuple[Config, Params]:
+def shipped() -> tuple[ModelConfig, Params]:
     """Load the weights that come with the package (preset `tiny`, trained on synthetic captures)."""
     return load(SHIPPED)
 
@@ -136,7 +141,7 @@ def unflatten(leaves: dict[str, Array], like: PyTree) -> PyTree:
     return jax.tree.unflatten(structure, filled)
 
 
-def expected_leaves(config: Config) -> dict[str, jax.ShapeDtypeStruct]:
+def expected_leaves(config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """Return shape and dtype of every parameter of a model, without computing any."""
     return flatten(describe(config))
 
@@ -201,7 +206,7 @@ def _narrowed(name: str, leaf: np.ndarray, dtype: Any) -> np.ndarray:
     return leaf.astype(dtype)
 
 
-def _read_config(path: Path) -> Config:
+def _read_config(path: Path) -> ModelConfig:
     file = path / CONFIG_FILE
     for needed in (path, file, path / ARRAYS_FOLDER):
         if not needed.exists():
@@ -230,7 +235,9 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
         ) from error
 
 
-def _config_difference(expected: Config, got: Config) -> str:
+def _config_difference(expected: ModelConfig, got: ModelConfig) -> str:
+    if type(expected) is not type(got):
+        return f"expected a {type(expected).__name__}, got a {type(got).__name__}"
     ours, theirs = json.loads(to_json(expected)), json.loads(to_json(got))
     lines = [
         f"`{key}` expected {ours.get(key)}, got {theirs.get(key)}"

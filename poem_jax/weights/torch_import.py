@@ -1,16 +1,19 @@
-"""Released POEM-v2 weights in, and ours out: between a PyTorch state dict and `(config, params)`.
+"""Released weights in, and ours out: between a PyTorch state dict and `(config, params)`.
 
-Arrays only: no torch. `io/torch_file.py` reads and writes the files.
+Arrays only: no torch. `io/torch_file.py` reads and writes the files. The names of each system's arrays stand
+in a table of their own; here is what they share.
 """
 
+import importlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from poem_jax.hand import mano_file
-from poem_jax.hand.model import HandModel
+from poem_jax.hand.model import HandModel, template_queries
 from poem_jax.hand.topology import (
     NUM_FACES,
     NUM_POSE_FEATURES,
@@ -19,24 +22,30 @@ from poem_jax.hand.topology import (
     NUM_SKELETON_JOINTS,
     NUM_VERTICES,
 )
-from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
-from poem_jax.models.hand_output import template_queries
-from poem_jax.models.network import describe, with_static_indices
-from poem_jax.models.presets import preset
+from poem_jax.models.config import Config, HRNetConfig, ModelConfig, ResNetConfig
+from poem_jax.models.mesh_transformer_config import MeshTransformerConfig
+from poem_jax.models.mvp_config import MvpConfig
+from poem_jax.models.network import constants_of, describe, with_static_indices
+from poem_jax.models.poem_v1_config import PoemV1Config
+from poem_jax.models.presets import DATASETS, RELEASED, released
 from poem_jax.typing import Float, Int, Params
-from poem_jax.weights.name_table import read_rows, write_rows
-from poem_jax.weights.release_keys import (
-    HEAD,
-    hand_prefixes,
-    is_parametric,
-    unused_shapes,
-    used_rows,
-)
+from poem_jax.weights.name_table import NameRow, read_rows, write_rows
+from poem_jax.weights.release_keys import HEAD, is_parametric
 from poem_jax.weights.store import expected_leaves, flatten, unflatten
 from poem_jax.weights.trunk_keys import trunk_rows
 
-VARIANTS = ("v2-small", "v2-medium", "v2-large", "v2-medium-mano")
-"""The released models; each is the preset of that name with the suffix `-release`."""
+VARIANTS = tuple(RELEASED)
+"""The released models; of POEM v2 each is the preset of that name with the suffix `-release`."""
+
+KEYS: dict[type[ModelConfig], str] = {
+    Config: "poem_jax.weights.release_keys",
+    PoemV1Config: "poem_jax.weights.v1_poem_keys",
+    MeshTransformerConfig: "poem_jax.weights.v1_mesh_keys",
+    MvpConfig: "poem_jax.weights.v1_mvp_keys",
+}
+"""The file with the table of names of each system, by config class. It has `used_rows`,
+`unused_shapes` and `hand_prefixes`, and may have `constant_rows` (what of a MANO asset goes beyond a hand
+model) and `aliases` (further names of arrays; `unused_shapes` names them too)."""
 
 _SHOWN = 12
 _SAME_HAND_M = 1e-6
@@ -60,15 +69,41 @@ _CLASSIFIER = ("incre_modules.", "downsamp_modules.", "final_layer.", "classifie
 _log = logging.getLogger(__name__)
 
 
+class Names(NamedTuple):
+    """Every name in the state dict of one released model."""
+
+    rows: list[NameRow]
+    """Arrays that the forward pass uses."""
+    unused: dict[str, tuple[int, ...]]
+    """Shapes of arrays on which no output depends, and of aliases."""
+    aliases: dict[str, str]
+    """Further names of arrays, and the names in `rows` of the same arrays."""
+    hands: dict[str, bool]
+    """Prefixes of the buffers `th_*` that hold a MANO asset, and whether an output uses them."""
+
+
+def names_of(config: ModelConfig) -> Names:
+    """Return the names of the released model of this config."""
+    keys = importlib.import_module(KEYS[type(config)])
+    rows, aliases = list(keys.used_rows(config)), {}
+    if hasattr(keys, "constant_rows"):
+        rows += keys.constant_rows(config)
+    if hasattr(keys, "aliases"):
+        aliases = keys.aliases(config)
+    return Names(rows, dict(keys.unused_shapes(config)), aliases, keys.hand_prefixes(config))
+
+
 def convert(
     state_dict: Mapping[str, np.ndarray],
     variant: str,
     *,
     mano: HandModel | str | Path,
-    basis_points: Float[np.ndarray, "*one basis 3"],
-    anchor_points: Float[np.ndarray, "*one anchor 3"],
-    anchor_indices: Int[np.ndarray, "*one anchor"],
-) -> tuple[Config, Params]:
+    basis_points: Float[np.ndarray, "*one basis 3"] | None = None,
+    anchor_points: Float[np.ndarray, "*one anchor 3"] | None = None,
+    anchor_indices: Int[np.ndarray, "*one anchor"] | None = None,
+    dataset: str = "dexycb",
+    num_views: int = 8,
+) -> tuple[ModelConfig, Params]:
     """Turn a released state dict into a model that `apply` runs.
 
     The hand is the one that the state dict carries, as in the released code; `mano` gives what its buffers do
@@ -78,32 +113,50 @@ def convert(
         state_dict: arrays by name; names may start with `module.`.
         variant: one of `VARIANTS`.
         mano: a right hand, or the path of a MANO `.pkl` or `.npz`.
-        basis_points: `bps.npy` of the release, metres about the root.
-        anchor_points: `anchor.npy`, in units of 10 cm about the root. Whether they lie on the template of the
-            hand is not checked here.
-        anchor_indices: `anchor_idx.npy`.
+        basis_points: POEM v2 alone, and needed there: `bps.npy` of the release, metres about the root.
+        anchor_points: likewise `anchor.npy`, in units of 10 cm about the root. Whether they lie on the
+            template of the hand is not checked here.
+        anchor_indices: likewise `anchor_idx.npy`.
+        dataset: POEM v1 and the baselines: what the model was trained on, one of `presets.DATASETS`. It fixes
+            the space in which hands are sought, which the arrays do not tell.
+        num_views: MvP alone: views that its layers are made for (8 in DexYCB, 5 in HO3D, 4 in OakInk).
 
     Returns: the config and the parameters, float32.
 
     Raises:
-        ValueError: unknown variant; a left hand; constants of a wrong shape; and, all reported together,
-            names that are missing or unknown and arrays of another shape.
+        ValueError: unknown variant or data set; constants that are missing, not asked for or of a wrong
+            shape; a left hand; and, all reported together, names that are missing or unknown, arrays of
+            another shape, and aliases that differ.
     """
-    if variant not in VARIANTS:
-        raise ValueError(f"`variant` must be one of {', '.join(VARIANTS)}; got {variant!r}")
-    config = preset(f"{variant}-release")
-    hand = _right_hand(mano)
+    config = released(variant, dataset=dataset, num_views=num_views)
+    assets = {
+        "basis_points": basis_points,
+        "anchor_points": anchor_points,
+        "anchor_indices": anchor_indices,
+    }
+    _check_assets(assets, variant, needed=isinstance(config, Config))
+    hand, names = _right_hand(mano), names_of(config)
     state = _without_prefix(state_dict)
-    leaves, problems = read_rows(list(used_rows(config)), state, expected_leaves(config))
-    problems += _unknown_or_unlike(state, config)
+    leaves, problems = read_rows(names.rows, state, expected_leaves(config))
+    problems += _unknown_or_unlike(state, names) + _differing_aliases(state, names)
     if problems:
-        raise ValueError(_report(problems, state, variant))
-    leaves |= _constants(config, state, hand, basis_points, anchor_points, anchor_indices)
+        raise ValueError(_report(problems, state, variant, config.view_range[1]))
+    if isinstance(config, Config):
+        leaves |= _constants(config, state, hand, names, **assets)
+    else:
+        leaves = _carried_constants(config, state, hand, names) | leaves
     _check_finite(leaves)
     return config, _params(config, leaves)
 
 
-def export_state_dict(config: Config, params: Params) -> dict[str, np.ndarray]:
+def _check_assets(assets: Mapping[str, Any], variant: str, *, needed: bool) -> None:
+    wrong = [name for name, array in assets.items() if (array is None) == needed]
+    if wrong:
+        wanted = "is needed, from the folder `assets` of the release" if needed else "must be None"
+        raise ValueError(f"for {variant} `{'`, `'.join(wrong)}` {wanted}")
+
+
+def export_state_dict(config: ModelConfig, params: Params) -> dict[str, np.ndarray]:
     """Turn a model back into a state dict that the released code loads.
 
     Arrays on which no output of the release depends are zero (scales and variances of norms: one).
@@ -111,22 +164,31 @@ def export_state_dict(config: Config, params: Params) -> dict[str, np.ndarray]:
     Raises:
         ValueError: `config` is none of the released models.
     """
-    if config not in [preset(f"{variant}-release") for variant in VARIANTS]:
+    if config not in _released_configs(config):
         raise ValueError(
-            "only the released models can be exported, the presets "
-            f"{', '.join(f'{variant}-release' for variant in VARIANTS)}; got another config"
+            f"only the released models can be exported, those of the variants {', '.join(VARIANTS)}; got "
+            "another config"
         )
-    leaves = flatten(params)
-    state = write_rows(list(used_rows(config)), leaves)
-    for name, shape in unused_shapes(config).items():
+    leaves, names = flatten(params), names_of(config)
+    state = write_rows(names.rows, leaves)
+    for name, shape in names.unused.items():
         state[name] = _neutral(name, shape)
+    state |= {alias: state[first] for alias, first in names.aliases.items()}
     hand = HandModel(**{name: np.asarray(leaves[f"constants.hand.{name}"]) for name in HandModel._fields})
-    for prefix in hand_prefixes(config):
+    for prefix in names.hands:
         state |= {prefix + name: array for name, array in _buffers(hand).items()}
     return state
 
 
-def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: Params) -> Params:
+def _released_configs(like: ModelConfig) -> Iterator[ModelConfig]:
+    """List the released configs that `like` may be."""
+    _, most = like.view_range
+    for variant in RELEASED:
+        for dataset in DATASETS:
+            yield released(variant, dataset=dataset, num_views=most or 8)
+
+
+def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, params: Params) -> Params:
     """Put ImageNet weights into the trunk of a model; all other parameters stay.
 
     Args:
@@ -138,7 +200,7 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: Config, params: P
     Raises:
         ValueError: all names that are missing or unknown and arrays of another shape.
     """
-    trunk: HRNetConfig | ResNetConfig = config.backbone
+    trunk: HRNetConfig | ResNetConfig = config.backbone  # pyright: ignore[reportAttributeAccessIssue]
     state = _without_prefix(state_dict)
     rows = list(trunk_rows(trunk))
     leaves, problems = read_rows(rows, state, expected_leaves(config))
@@ -196,11 +258,12 @@ def _right_hand(mano: HandModel | str | Path) -> HandModel:
     return hand
 
 
-def _unknown_or_unlike(state: dict[str, np.ndarray], config: Config) -> list[str]:
+def _unknown_or_unlike(state: dict[str, np.ndarray], names: Names) -> list[str]:
     """List the problems of everything that the forward pass does not use."""
-    shapes = unused_shapes(config)
-    shapes |= {prefix + name: shape for prefix in hand_prefixes(config) for name, shape in _BUFFERS.items()}
-    live = {row.source for row in used_rows(config)}
+    shapes = names.unused | {
+        prefix + name: shape for prefix in names.hands for name, shape in _BUFFERS.items()
+    }
+    live = {row.source for row in names.rows}
     problems = [f"{name}: missing, expected {shape}" for name, shape in shapes.items() if name not in state]
     for name, array in state.items():
         if name in shapes and array.shape != shapes[name]:
@@ -210,9 +273,20 @@ def _unknown_or_unlike(state: dict[str, np.ndarray], config: Config) -> list[str
     return problems
 
 
-def _report(problems: list[str], state: dict[str, np.ndarray], variant: str) -> str:
+def _differing_aliases(state: dict[str, np.ndarray], names: Names) -> list[str]:
+    """List the further names of an array that hold another one."""
+    return [
+        f"{alias}: expected the numbers of {first}, of which it is another name; got others"
+        for alias, first in names.aliases.items()
+        if {alias, first} <= state.keys() and not np.array_equal(state[alias], state[first])
+    ]
+
+
+def _report(problems: list[str], state: dict[str, np.ndarray], variant: str, most_views: int | None) -> str:
     looks_like = _guess(state)
     hint = "Is the file cut short, or of another model?"
+    if most_views is not None:
+        hint = f"Is the file cut short, of another model, or not of `num_views` = {most_views}?"
     if looks_like not in (None, variant):
         hint = f"The state dict looks like {looks_like}: pass that variant."
     return f"the state dict does not fit {variant}: {_shown(problems)}. {hint}"
@@ -222,11 +296,27 @@ def _guess(state: dict[str, np.ndarray]) -> str | None:
     """Tell the variant by the width of the query embeddings and by the parametric head."""
     table = state.get(f"{HEAD}query_feat_embedding.weight")
     if table is None or table.ndim != 2:
-        return None
+        return _guess_by_names(state)
     parametric = any(name.endswith("mano_linear.weight") for name in state)
-    for variant in VARIANTS:
-        config = preset(f"{variant}-release")
-        if (config.width, is_parametric(config)) == (table.shape[1], parametric):
+    for variant in RELEASED:
+        config = released(variant)
+        if isinstance(config, Config) and (config.width, is_parametric(config)) == (
+            table.shape[1],
+            parametric,
+        ):
+            return variant
+    return None
+
+
+def _guess_by_names(state: dict[str, np.ndarray]) -> str | None:
+    """Return the variant, not of POEM v2, that has exactly these names and shapes, if one has."""
+    for variant in RELEASED:
+        config = released(variant)
+        if isinstance(config, Config):
+            continue
+        names = names_of(config)
+        _, problems = read_rows(names.rows, state, expected_leaves(config))
+        if not problems and not _unknown_or_unlike(state, names):
             return variant
     return None
 
@@ -236,15 +326,25 @@ def _shown(problems: list[str]) -> str:
     return f"{len(problems)} problems: {'; '.join(problems[:_SHOWN])}{more}"
 
 
+def _carried_constants(
+    config: ModelConfig, state: dict[str, np.ndarray], hand: HandModel, names: Names
+) -> dict[str, np.ndarray]:
+    """Return what a fresh model with the hand of the state dict has for constants."""
+    prefix = next((prefix for prefix, used in names.hands.items() if used), next(iter(names.hands)))
+    return flatten({"constants": constants_of(config, _carried_hand(state, prefix, hand))})
+
+
 def _constants(
     config: Config,
     state: dict[str, np.ndarray],
     hand: HandModel,
-    basis_points: np.ndarray,
-    anchor_points: np.ndarray,
-    anchor_indices: np.ndarray,
+    names: Names,
+    *,
+    basis_points: Any,
+    anchor_points: Any,
+    anchor_indices: Any,
 ) -> dict[str, np.ndarray]:
-    prefixes = [prefix for prefix, used in hand_prefixes(config).items() if used]
+    prefixes = [prefix for prefix, used in names.hands.items() if used]
     # The head's hand gives the template, the last layer's the parametric output.
     template_hand, output_hand = (
         _carried_hand(state, prefix, hand) for prefix in (prefixes[0], prefixes[-1])
@@ -324,7 +424,7 @@ def _check_finite(leaves: dict[str, np.ndarray]) -> None:
         )
 
 
-def _params(config: Config, leaves: dict[str, np.ndarray]) -> Params:
+def _params(config: ModelConfig, leaves: dict[str, np.ndarray]) -> Params:
     """Nest the leaves; every one of the model's must be there."""
     template = expected_leaves(config)
     missing = template.keys() - leaves.keys()

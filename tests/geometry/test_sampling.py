@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.geometry.sampling import sample_bilinear, soft_argmax
+from poem_jax.geometry.sampling import sample_bilinear, sample_levels, soft_argmax
 
 
 def _naive(feature_map: np.ndarray, u: float, v: float) -> np.ndarray:
@@ -70,3 +70,14 @@ def test_soft_argmax_gradients(rng, check_gradients):
     empty = jnp.zeros((4, 6))
     np.testing.assert_array_equal(soft_argmax(empty), [3, 2])
     assert np.isfinite(jax.jit(jax.jacobian(soft_argmax))(empty)).all()
+
+
+def test_levels_are_read_as_each_alone():
+    rng = np.random.default_rng(0)
+    maps = [rng.normal(size=(2, 3, h, w, 5)).astype(np.float32) for h, w in ((2, 3), (4, 6), (7, 5))]
+    uv_share = rng.uniform(-0.5, 1.5, (2, 3, 3, 40, 2)).astype(np.float32)
+    uv_share[0, 0, :, 0] = np.inf
+    together = sample_levels(maps, uv_share)
+    for i, x in enumerate(maps):
+        alone = sample_bilinear(x, uv_share[:, :, i] * np.array(x.shape[-3:-1][::-1], np.float32))
+        np.testing.assert_allclose(together[:, :, i], alone, rtol=0, atol=1e-6)

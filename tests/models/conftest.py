@@ -10,6 +10,7 @@ import pytest
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
+from poem_jax.hand.model import template_queries
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import (
     AggregationConfig,
@@ -21,7 +22,6 @@ from poem_jax.models.config import (
     RootConfig,
     Similarity,
 )
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.network import describe
 from poem_jax.models.point_features import basis_points
 from tests import micro

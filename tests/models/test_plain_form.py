@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from poem_jax.geometry.neighbours import farthest_points
+from poem_jax.hand.model import template_queries
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_QUERIES, ROOT_JOINT
 from poem_jax.models import apply, infer
 from poem_jax.models.config import DecoderOutput, Design, ViewWeights
-from poem_jax.models.hand_output import template_queries
 from poem_jax.models.presets import TINY, V2_MEDIUM_RELEASE, preset
 from tests.models import numpy_geometry
 

@@ -17,7 +17,8 @@ from poem_jax.geometry.neighbours import nearest
 from poem_jax.models import aggregation, decoder, heat_maps, layers, network, point_features, vector_attention
 from poem_jax.models.backbones import HRNet
 from poem_jax.models.config import Config
-from poem_jax.models.network import ViewFeatures, assemble
+from poem_jax.models.network import assemble
+from poem_jax.models.poem_v2 import ViewFeatures
 from poem_jax.models.world_frame import WorkingFrame
 from poem_jax.typing import Array, Params
 
