@@ -315,8 +315,10 @@ def _jitted(part: Callable) -> Callable:
 
 
 def _trunk(prepared, images):
+    from poem_jax.models.layers import trunk_images
+
     model = _module(prepared)
-    return model.trunk(model._normalised(images), _mode())
+    return model.trunk(trunk_images(images, model.config, model.basis_points[...].dtype), _mode())
 
 
 def _branches(prepared, levels):
@@ -337,8 +339,11 @@ def _decode(prepared, inputs):
 
 def _module(prepared):
     from poem_jax.models.network import assemble
+    from poem_jax.models.poem_v2 import Poem
 
-    return assemble(prepared.config, prepared.params)
+    model = assemble(prepared.config, prepared.params)
+    assert isinstance(model, Poem), f"only POEM v2's parts are timed one by one; got {type(model).__name__}"
+    return model
 
 
 def _mode():
@@ -363,10 +368,12 @@ def _model(preset: str):
     from poem_jax.geometry.neighbours import farthest_points
     from poem_jax.hand.model import template_queries
     from poem_jax.hand.template import default_hand
+    from poem_jax.models.config import Config
     from poem_jax.models.network import describe
     from poem_jax.models.point_features import basis_points
 
     config, rng = poem_jax.preset(preset), np.random.default_rng(0)
+    assert isinstance(config, Config), f"only POEM v2's models are timed; got {type(config).__name__}"
     shapes = describe(config)
 
     def draw(path, leaf):

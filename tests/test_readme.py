@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from poem_jax import preset
+
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 DOCUMENTS = [README, *sorted((ROOT / "docs").glob("*.md"))]
@@ -24,6 +26,13 @@ def test_no_number_is_left_blank(document: Path) -> None:
 def test_linked_files_and_pictures_exist(document: Path) -> None:
     targets = [t.split("#")[0] for t in LINK.findall(document.read_text()) if "://" not in t]
     assert [t for t in targets if t and not (document.parent / t).exists()] == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_linked_sections_exist(document: Path) -> None:
+    titles = re.findall(r"^#+ (.+)$", document.read_text(), re.MULTILINE)
+    sections = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    assert [t for t in LINK.findall(document.read_text()) if t[0] == "#" and t[1:] not in sections] == []
 
 
 def test_commands_of_the_readme_are_targets_of_make() -> None:
@@ -46,3 +55,11 @@ def test_the_code_of_the_readme_runs_anywhere_and_reconstructs_a_hand(tmp_path) 
     error, unit = done.stdout.split()
     assert unit == "mm"
     assert 0 < float(error) < 30
+
+
+def test_the_experiment_of_the_models_page_can_be_made() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
+    names: dict = {}
+    exec(compile(code, "docs/models.md", "exec"), names)
+    assert names["config"].model == preset("v1")
+    assert names["config"].loss.name == "v1"

@@ -29,9 +29,9 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.hand.model import mirror_pose
 from poem_jax.hand.topology import ROOT_JOINT
-from poem_jax.models.apply import check_view_count
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
+from poem_jax.models.network import check_view_count
 from poem_jax.typing import Array, Int, Params
 from poem_jax.weights import store
 

@@ -6,6 +6,7 @@ reads the images does worse without its features on the very same captures; one 
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -182,7 +183,8 @@ def _errors_of_batch(params: Params, config: Config, rendered: list[SyntheticSam
     joints = slice(None) if num_joints == NUM_JOINTS else slice(ROOT_JOINT, ROOT_JOINT + 1)
     truth_px, shown = np.asarray(batch.keypoints_px)[..., joints, :], shown[..., joints]
     root, unknown = batch.joints_world[:, ROOT_JOINT], np.full((len(rendered), 3), np.nan, np.float32)
-    maps = seen.feature_maps
+    nothing = _with_maps(seen, jnp.zeros_like)
+    others = _with_maps(seen, functools.partial(jnp.roll, shift=1, axis=0))
 
     def layers(given: ViewFeatures, root_world: Array) -> Float[np.ndarray, "sample layer"]:
         found = _find(params, given, batch.views, batch.cameras, root_world, config=config)
@@ -193,12 +195,20 @@ def _errors_of_batch(params: Params, config: Config, rendered: list[SyntheticSam
     return StageErrors(
         posed=_posed_mm(params, config, seen, batch.views, batch.cameras, batch.vertices_world),
         layers=layers(seen, unknown),
-        zero=layers(seen._replace(feature_maps=jnp.zeros_like(maps)), unknown)[:, -1],
-        another=layers(seen._replace(feature_maps=jnp.roll(maps, 1, axis=0)), unknown)[:, -1],
+        zero=layers(nothing, unknown)[:, -1],
+        another=layers(others, unknown)[:, -1],
         true_root=layers(seen, root)[:, -1],
         true_joints=layers(seen._replace(keypoints_px=jnp.asarray(truth_px)), unknown)[:, -1],
         keypoint_share=share.mean((1, 2)),
         hidden_share=np.where(shown, 0, share).sum((1, 2)) / np.maximum(share.sum((1, 2)), 1e-9),
+    )
+
+
+def _with_maps(seen: ViewFeatures, change: Callable[[Array], Array]) -> ViewFeatures:
+    """Change what the second stage reads; the first stage's heat maps and key points stay."""
+    return seen._replace(
+        feature_maps=change(seen.feature_maps),
+        evidence=None if seen.evidence is None else change(seen.evidence),
     )
 
 

@@ -105,7 +105,7 @@ def check_inputs(
     _check_taken(config, root_world=root_world, ball_index=ball_index, key=key)
     _check_types(views, cams, root_world)
     _check_views(views, config)
-    check_view_count(config, views.shape[1])
+    network.check_view_count(config, views.shape[1])
     if ball_index is not None and config.grid_draw is not None:
         _check_ball_index(ball_index, len(views), views.shape[1], config.grid_draw)
     if np.shape(cams.K) != (*views.shape[:2], 3, 3):
@@ -120,17 +120,6 @@ def check_inputs(
     if not traced:
         _check_view_counts(cams, root_world, config)
         _check_float_images(views, np.asarray(cams.view_mask))
-
-
-def check_view_count(config: ModelConfig, num_views: int, name: str = "`views`") -> None:
-    """Raise `ValueError` for a padded number of views that a system cannot take; `name` is what has them."""
-    least, most = config.view_range
-    if num_views < least or (most is not None and num_views > most):
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        raise ValueError(
-            f"{name} must have {wanted} views, as the layers of this {type(config).__name__} are made for; "
-            f"got {num_views}. Leave views out, pad with masked ones, or take a model for {num_views}"
-        )
 
 
 def _check_taken(config: ModelConfig, *, root_world: Any, ball_index: Any, key: Any) -> None:

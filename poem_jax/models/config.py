@@ -79,6 +79,7 @@ class HRNetConfig:
     def __post_init__(self) -> None:
         require_counts(self, "width", "stem_channels")
         require_counts(self, "stem_blocks", "modules", "blocks", most=MAX_LAYERS)
+        require(self.stem_blocks >= 2, f"`stem_blocks` must be at least 2; got {self.stem_blocks}")
         require(len(self.modules) == 3, f"`modules` must name stages 2, 3 and 4; got {self.modules}")
 
     @property
@@ -328,6 +329,34 @@ class DecoderConfig:
 
 
 @dataclass(frozen=True)
+class JointDecoderConfig:
+    """Layers that move the 21 joints before the template is posed by them (ours)."""
+
+    num_layers: int = 2
+    width: int = 128
+    num_heads: int = 4
+    num_blocks: int = 2
+    """Attention blocks in every layer."""
+    ffn_expansion: int = 2
+    shells_m: tuple[float, ...] = (0.005, 0.01, 0.018, 0.03)
+    """Radii of the shells of basis points about every joint, metres."""
+    picked_features: int = 16
+    """Numbers that a joint takes from the feature maps at its own place."""
+
+    def __post_init__(self) -> None:
+        require_counts(self, "num_layers", "num_blocks", "ffn_expansion", most=MAX_LAYERS)
+        require_counts(self, "width", "num_heads", "picked_features")
+        require(
+            self.width % self.num_heads == 0,
+            f"`width` must be a multiple of `num_heads` = {self.num_heads}; got {self.width}",
+        )
+        require(
+            1 <= len(self.shells_m) <= MAX_LAYERS and all(0 < r < math.inf for r in self.shells_m),
+            f"`shells_m` must name 1 to {MAX_LAYERS} positive radii, metres; got {self.shells_m}",
+        )
+
+
+@dataclass(frozen=True)
 class CropConfig:
     """The pictures that a model was trained on."""
 
@@ -407,6 +436,8 @@ class Config(ModelConfig):
     features: FeatureConfig = FeatureConfig()
     basis: BasisConfig = BasisConfig()
     aggregation: AggregationConfig = AggregationConfig()
+    joint_decoder: JointDecoderConfig | None = None
+    """None = the template is posed by the triangulated joints as they are, or stands about the root."""
     decoder: DecoderConfig = DecoderConfig()
 
     def __post_init__(self) -> None:
@@ -462,6 +493,12 @@ class Config(ModelConfig):
         require(
             self.decoder.first_queries is FirstQueries.TEMPLATE or self.root.num_joints == NUM_JOINTS,
             f"`first_queries` = joints needs `root.num_joints` = {NUM_JOINTS}; got {self.root.num_joints}",
+        )
+        require(
+            self.joint_decoder is None
+            or (self.decoder.first_queries is FirstQueries.JOINTS and self.root.design is Design.PAPER),
+            "`joint_decoder` moves the joints that pose the template, by maps of the paper's form: it needs "
+            "`decoder.first_queries` = joints and `root.design` = paper",
         )
 
     @property

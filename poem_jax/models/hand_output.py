@@ -55,13 +55,13 @@ def pose_by_joints(
         template_joints: the joints at rest, OpenPose order.
         joints: where they were observed, metres, any frame.
     """
-    palm = matmul(transpose(_palm_frame(joints)), _palm_frame(template_joints))
+    palm = matmul(transpose(palm_frame(joints)), palm_frame(template_joints))
     turns = _bone_turns(palm, template_joints, joints)
     rest = template_joints[_SKELETON]
     return PosedHand(hand, template_vertices, rest, turns, joints[..., _SKELETON, :]).skin().vertices
 
 
-def _palm_frame(joints: Float[Array, "*batch 21 3"]) -> Float[Array, "*batch 3 3"]:
+def palm_frame(joints: Float[Array, "*batch 21 3"]) -> Float[Array, "*batch 3 3"]:
     """Return rows: along the palm (wrist to knuckles), across it, and its normal."""
     knuckles = joints[..., _KNUCKLES, :]
     along = jnp.mean(knuckles, -2) - joints[..., WRIST, :]

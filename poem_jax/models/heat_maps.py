@@ -13,7 +13,7 @@ from poem_jax.models.config import Design, HeatActivation, HRNetConfig, ResNetCo
 from poem_jax.models.layers import Conv, NormMode, TopDownBranch, max_pool
 from poem_jax.typing import Array, Bool, Float
 
-_FALLBACK_ROOT = (0.0, 0.0, 0.5)
+FALLBACK_ROOT = (0.0, 0.0, 0.5)
 """Where the second stage works for samples without a root: in front of the primary camera, all finite."""
 _MIN_VARIANCE = 0.25
 """Cells squared. Narrower heat maps weigh no more than this in the triangulation."""
@@ -89,7 +89,7 @@ def root_point(
     known = jnp.all(jnp.isfinite(known_root), -1)
     root = jnp.where(known[:, None], known_root, joints[:, index])
     valid = (known | solved[:, index]) & jnp.any(view_mask, -1)
-    return jnp.where(valid[:, None], root, jnp.array(_FALLBACK_ROOT, root.dtype)), valid
+    return jnp.where(valid[:, None], root, jnp.array(FALLBACK_ROOT, root.dtype)), valid
 
 
 def heat_variance(heat_maps: Float[Array, "*batch h w"]) -> Float[Array, "*batch"]:

@@ -99,7 +99,11 @@ def infer_unchecked(
 
     A view that is masked, or whose image or camera is not finite, is left out. On a CPU a sample without any
     view costs nothing and is zero.
+
+    Raises:
+        ValueError: a padded number of views that the system cannot take.
     """
+    network.check_view_count(prepared.config, views.shape[1])
     draw = network.Draw.of(prepared.config, ball_index, key)
     return _infer_in_frame(prepared, views, _frame(prepared, views, cams, root_world), draw)
 

@@ -7,6 +7,7 @@ Weights are drawn by NumPy, seeded by the JAX key: compiling JAX's generators fo
 takes a minute. Under a trace JAX draws them: other numbers of the same distribution.
 """
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ import numpy as np
 from flax import nnx
 from jax.core import Tracer
 
-from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
+from poem_jax.models.config import ModelConfig
+from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
 
 BATCH_NORM_EPSILON = 1e-5
 BATCH_NORM_MOMENTUM = 0.1
@@ -35,6 +37,16 @@ class NormMode(NamedTuple):
     def training(self) -> bool:
         """Whether the moments of the images at hand are used."""
         return self.image_mask is not None
+
+
+def trunk_images(
+    views: Num[Array, "*batch h w 3"], config: ModelConfig, dtype: Any
+) -> Float[Array, "image h w 3"]:
+    """Return views, uint8 or float in [0, 1], as the trunk of a model takes them: in one row, about the
+    config's mean and over its standard deviation."""
+    scale = 255.0 if views.dtype == jnp.uint8 else 1.0
+    images = jnp.asarray(views.reshape(-1, *views.shape[-3:]), dtype) / scale
+    return (images - config.image_mean) / config.image_std
 
 
 class MaskedBatchNorm(nnx.Module):
@@ -196,9 +208,15 @@ def repeat_pixels(x: Float[Array, "image h w c"], factor: int) -> Float[Array, "
 
 
 def max_pool(x: Float[Array, "image h w c"], factor: int) -> Float[Array, "image h2 w2 c"]:
-    """Reduce to the largest of every `factor` x `factor` pixels."""
+    """Reduce to the largest of every `factor` x `factor` pixels.
+
+    Two by two: the gradient of one maximum of many looks for the number that equals it, and where a compiler
+    computes that number twice, rounded differently, none does and the gradient is 0 / 0.
+    """
     image, h, w, c = x.shape
-    return jnp.max(x.reshape(image, h // factor, factor, w // factor, factor, c), (2, 4))
+    cells = x.reshape(image, h // factor, factor, w // factor, factor, c)
+    rows = functools.reduce(jnp.maximum, (cells[:, :, i] for i in range(factor)))
+    return functools.reduce(jnp.maximum, (rows[..., i, :] for i in range(factor)))
 
 
 def double_bilinear(x: Float[Array, "image h w c"]) -> Float[Array, "image h2 w2 c"]:

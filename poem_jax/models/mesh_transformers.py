@@ -53,7 +53,16 @@ from poem_jax.models.frustum import (
     sigmoid_step,
     view_row_column_code,
 )
-from poem_jax.models.layers import Conv, ConvNorm, NormMode, TopDownBranch, linear, normal, uniform
+from poem_jax.models.layers import (
+    Conv,
+    ConvNorm,
+    NormMode,
+    TopDownBranch,
+    linear,
+    normal,
+    trunk_images,
+    uniform,
+)
 from poem_jax.models.mesh_transformer_config import (
     CanonicalFusion,
     MeshTransformerConfig,
@@ -108,7 +117,7 @@ class MeshTransformer(nnx.Module):
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewMaps:
         """Do what is done with every view alone: trunk and feature map; any leading axes."""
-        levels = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
+        levels = self.trunk(trunk_images(views, self.config, self.hand.model().v_template.dtype), mode)
         maps = self.features(levels, mode)
         return ViewMaps(maps.reshape(*views.shape[:-3], *maps.shape[1:]))
 
@@ -139,11 +148,6 @@ class MeshTransformer(nnx.Module):
             parameters=None,
         )
         return leave_working_frame(found, frame, self.hand.model(), self.config.query_order)
-
-    def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.hand.model().v_template.dtype) / scale
-        return (images - self.config.image_mean) / self.config.image_std
 
 
 # The map of every view.

@@ -68,7 +68,16 @@ from poem_jax.models.decoder import PAPER_EPSILON, MultiHeadAttention, OffsetNet
 from poem_jax.models.deformable_attention import sample_deformed
 from poem_jax.models.frustum import denormalised, sigmoid_step
 from poem_jax.models.hand_output import HandParameters
-from poem_jax.models.layers import ConvNorm, NormMode, dropout, layer_norm, linear, normal, uniform
+from poem_jax.models.layers import (
+    ConvNorm,
+    NormMode,
+    dropout,
+    layer_norm,
+    linear,
+    normal,
+    trunk_images,
+    uniform,
+)
 from poem_jax.models.mvp_config import NUM_LEVELS, MvpConfig, MvpDecoderConfig
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.point_features import valid_views_first
@@ -109,7 +118,7 @@ class Mvp(nnx.Module):
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewLevels:
         """Do what is done with every view alone: the trunk's three coarsest maps, at one width."""
-        maps = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
+        maps = self.trunk(trunk_images(views, self.config, self.pose_components[...].dtype), mode)
         levels = (reduce(x, mode) for reduce, x in zip(self.reduce, maps[::-1], strict=False))
         return ViewLevels(tuple(x.reshape(*views.shape[:-3], *x.shape[1:]) for x in levels))
 
@@ -124,13 +133,8 @@ class Mvp(nnx.Module):
         """Join what was seen in the views (batch, view) to one hand per sample, in the user's world.
 
         A sample is valid if any of its views is. `mode` is not used: nothing here has a batch norm.
-
-        Raises:
-            ValueError: another number of views than the config's, masked ones counted.
         """
-        config = self.config
-        require_views(config, frame.cams.view_mask.shape[1])
-        scene = view_scene(config, seen, frame.cams)
+        scene = view_scene(self.config, seen, frame.cams)
         mean_features = jnp.stack([jnp.mean(x, (2, 3)) for x in scene.levels], 2)
         x, places, shares = self.queries(mean_features.reshape(len(mean_features), -1))
         joints, numbers = [], []
@@ -166,21 +170,6 @@ class Mvp(nnx.Module):
             else None,
         )
         return leave_working_frame(found, frame, hand, config.query_order)
-
-    def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.pose_components[...].dtype) / scale
-        return (images - self.config.image_mean) / self.config.image_std
-
-
-def require_views(config: MvpConfig, num_views: int) -> None:
-    """Raise `ValueError` unless the view axis is as long as the layers of the model are made for."""
-    if num_views != config.num_views:
-        raise ValueError(
-            f"this MvP takes {config.num_views} views, since its layers are made for that; got {num_views}. "
-            "Leave views out, or pad with views whose `view_mask` is False, or make a model of `num_views` = "
-            f"{num_views}"
-        )
 
 
 class Scene(NamedTuple):

@@ -133,6 +133,7 @@ def forward(
     config: ModelConfig,
     root_world: Float[Array, "batch 3"] | None = None,
     train: bool = False,
+    frozen_views: bool = False,
     key: PRNGKeyArray | None = None,
     ball_index: Int[Array, "batch point"] | None = None,
     draw_key: PRNGKeyArray | None = None,
@@ -147,18 +148,24 @@ def forward(
         config: the configuration that `params` were made with.
         root_world: as in `apply`, in training the noisy true root; NaN rows are triangulated.
         train: normalise by the moments of this batch's valid views and move the running statistics.
+        frozen_views: in training, do with every view alone what is done at inference, and let no gradient
+            into it.
         key: in training, what dropout draws from; None = nothing is dropped.
         ball_index: as in `apply`.
         draw_key: the `key` of `apply`.
         axis_name: device axis over which the moments are averaged.
 
     Returns: the prediction, and the new `params["statistics"]` (unchanged unless `train`).
+
+    Raises:
+        ValueError: a padded number of views that the system cannot take.
     """
     frame = enter_working_frame(views, cams, root_world, number_type(params))
     model = assemble(config, params)
     mode = NormMode(frame.cams.view_mask.reshape(-1) if train else None, axis_name)
     draw = Draw.of(config, ball_index, draw_key)
-    prediction = reconstruct(model, views, frame, mode, draw, key if train else None)
+    dropout_key = key if train else None
+    prediction = reconstruct(model, views, frame, mode, draw, dropout_key, frozen_views=frozen_views)
     return prediction, statistics(model) if train else params["statistics"]
 
 
@@ -169,11 +176,27 @@ def reconstruct(
     mode: NormMode,
     draw: Draw,
     dropout_key: PRNGKeyArray | None = None,
+    *,
+    frozen_views: bool = False,
 ) -> Prediction:
-    """Reconstruct one hand per sample in the user's world, from within the working frame."""
+    """Reconstruct one hand per sample in the user's world, from within the working frame; `frozen_views` as
+    in `forward`."""
+    check_view_count(model.config, views.shape[1])
     shown = jnp.where(frame.cams.view_mask[..., None, None, None], views, 0)
-    seen = model.look(shown, mode)
+    seen = model.look(shown, NormMode() if frozen_views else mode)
+    seen = jax.lax.stop_gradient(seen) if frozen_views else seen
     return model.find_hands(seen, frame, mode, dropout_key=dropout_key, **draw.arguments())
+
+
+def check_view_count(config: ModelConfig, num_views: int, name: str = "`views`") -> None:
+    """Raise `ValueError` for a padded number of views that a system cannot take; `name` is what has them."""
+    least, most = config.view_range
+    if num_views < least or (most is not None and num_views > most):
+        wanted = f"{least}" if least == most else f"{least} to {most}"
+        raise ValueError(
+            f"{name} must have {wanted} views, as the layers of this {type(config).__name__} are made for; "
+            f"got {num_views}. Leave views out, pad with masked ones, or take a model for {num_views}"
+        )
 
 
 def number_type(params: Params) -> Any:

@@ -40,7 +40,15 @@ from poem_jax.models.decoder import PAPER_EPSILON, MultiHeadAttention, OffsetNet
 from poem_jax.models.detr import DetrDecoder
 from poem_jax.models.frustum import frustum_grid
 from poem_jax.models.heat_maps import HeatMapBranch
-from poem_jax.models.layers import Conv, NormMode, TopDownBranch, layer_norm, linear, normal
+from poem_jax.models.layers import (
+    Conv,
+    NormMode,
+    TopDownBranch,
+    layer_norm,
+    linear,
+    normal,
+    trunk_images,
+)
 from poem_jax.models.mesh_transformer_config import MeshTransformerConfig, PositionEmbeddedFusion
 from poem_jax.models.mesh_transformers import EmbeddedPositions
 from poem_jax.models.mesh_transformers import OffsetNetwork as MeshOffsetNetwork
@@ -98,7 +106,7 @@ class PoemV1(nnx.Module):
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
         """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
-        levels = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
+        levels = self.trunk(trunk_images(views, self.config, self.hand.model().v_template.dtype), mode)
         heat = (None, None) if self.heat_maps is None else self.heat_maps(levels, mode)
         seen = ViewFeatures(*heat, self.features(levels, mode), jnp.mean(levels[-1], (1, 2)))
         return jax.tree.map(lambda leaf: leaf.reshape(*views.shape[:-3], *leaf.shape[1:]), seen)
@@ -161,11 +169,6 @@ class PoemV1(nnx.Module):
         key = jax.random.key(0) if key is None else key
         ball = draw_ball(self.config.basis, grid, start.centre, cams.view_mask, key)
         return Basis(ball.index, ball.count > 0)
-
-    def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.hand.model().v_template.dtype) / scale
-        return (images - self.config.image_mean) / self.config.image_std
 
 
 # Second stage of the paper.

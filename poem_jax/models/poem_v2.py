@@ -15,18 +15,20 @@ from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, primary_view
 from poem_jax.geometry.neighbours import farthest_points
 from poem_jax.hand.model import HandModel, template_queries
-from poem_jax.hand.topology import join_queries
+from poem_jax.hand.topology import join_queries, split_queries
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import HRNet, ResNet
 from poem_jax.models.config import Config, DecoderOutput, Design, FirstQueries, HRNetConfig
 from poem_jax.models.decoder import Decoder, Surroundings
 from poem_jax.models.hand_output import ParameterRegressor, first_queries, root_relative_mesh
-from poem_jax.models.heat_maps import HeatMapBranch, root_point, triangulate_joints
-from poem_jax.models.layers import NormMode
+from poem_jax.models.heat_maps import FALLBACK_ROOT, HeatMapBranch, root_point, triangulate_joints
+from poem_jax.models.joint_decoder import JointDecoder
+from poem_jax.models.layers import NormMode, trunk_images
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.point_features import (
     FeatureBranch,
     basis_points,
+    evidence,
     projected_features,
     sine_code,
     valid_views_first,
@@ -43,6 +45,8 @@ class ViewFeatures(NamedTuple):
     heat_maps: Float[Array, "*batch joint h w"]
     feature_maps: Float[Array, "*batch h w c"]
     """Without the release's position code, which depends on the other views."""
+    evidence: Float[Array, "*batch joint h w"] | None
+    """Logarithms of `heat_maps` over an even one, for the joint decoder; None without one."""
 
 
 class AnchorConstants(nnx.Module):
@@ -73,6 +77,11 @@ class Poem(nnx.Module):
         self.heat_maps = HeatMapBranch(config.root, trunk, rngs=rngs)
         self.features = FeatureBranch(config, rngs=rngs)
         self.aggregation = ProjectiveAggregation(config.aggregation, config.width, rngs=rngs)
+        self.joint_decoder = (
+            None
+            if config.joint_decoder is None
+            else JointDecoder(config.joint_decoder, config.width, config.basis.radius, rngs=rngs)
+        )
         self.decoder = Decoder(config.decoder, config.width, rngs=rngs)
         parametric = config.decoder.output is DecoderOutput.HAND_PARAMETERS
         is_release = config.decoder.layer is Design.RELEASE
@@ -87,10 +96,11 @@ class Poem(nnx.Module):
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
         """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
-        levels = self.trunk(self._normalised(views.reshape(-1, *views.shape[-3:])), mode)
+        levels = self.trunk(trunk_images(views, self.config, self.basis_points[...].dtype), mode)
         keypoints_px, heat_maps = self.heat_maps(levels, mode)
-        seen = ViewFeatures(keypoints_px, heat_maps, self.features(levels, heat_maps, mode))
-        return ViewFeatures(*(leaf.reshape(*views.shape[:-3], *leaf.shape[1:]) for leaf in seen))
+        said = None if self.joint_decoder is None else jnp.moveaxis(evidence(heat_maps), -1, -3)
+        seen = ViewFeatures(keypoints_px, heat_maps, self.features(levels, heat_maps, mode), said)
+        return jax.tree.map(lambda leaf: leaf.reshape(*views.shape[:-3], *leaf.shape[1:]), seen)
 
     def find_hands(
         self,
@@ -111,14 +121,17 @@ class Poem(nnx.Module):
         joints = jax.lax.stop_gradient(reference_joints) if mode.training else reference_joints
         root, valid = root_point(joints, solved, frame.known_root, cams.view_mask)
 
+        all_solved = jnp.all(solved, -1)
+        joint_layers = self._move_joints(joints, all_solved, seen, cams, mode)
+        starts = [self._start(at - root[:, None], all_solved) for at in [joints, *joint_layers]]
         basis_features = self._read_views(seen.feature_maps, cams, root)
-        start = self._start(joints - root[:, None], jnp.all(solved, -1))
         first = self.first_surroundings() if first is None else first
         moved, embeddings = self.decoder(
-            start / radius, self.basis_points[...] / radius, basis_features, first, dropout_key
+            starts[-1] / radius, self.basis_points[...] / radius, basis_features, first, dropout_key
         )
 
-        hand, layers, parameters = self.hand.model(), [radius * queries for queries in moved], None
+        hand, parameters = self.hand.model(), None
+        layers = [*starts[1:], *(radius * queries for queries in moved)]
         if self.regressor is not None:
             parameters = self.regressor(embeddings)
             layers.append(join_queries(*root_relative_mesh(hand, parameters), config.decoder.query_order))
@@ -148,11 +161,6 @@ class Poem(nnx.Module):
         start = self.template_queries[...] / self.config.basis.radius
         return self.decoder.layers[0].with_deltas(start[None], first)  # pyright: ignore[reportAttributeAccessIssue]
 
-    def _normalised(self, views: Num[Array, "image h w 3"]) -> Float[Array, "image h w 3"]:
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        images = jnp.asarray(views, self.basis_points[...].dtype) / scale
-        return (images - self.config.image_mean) / self.config.image_std
-
     def _read_views(
         self, feature_maps: Float[Array, "batch view h w c"], cams: Cameras, root: Float[Array, "batch 3"]
     ) -> Float[Array, "batch basis c"]:
@@ -168,6 +176,25 @@ class Poem(nnx.Module):
         if by_paper:
             sampled = sampled + sine_code(uv_share, sampled.shape[-1])
         return self.aggregation(sampled, cams.view_mask, primary_view(cams.view_mask))
+
+    def _move_joints(
+        self, joints: Array, solved: Array, seen: ViewFeatures, cams: Cameras, mode: NormMode
+    ) -> list[Float[Array, "batch 21 3"]]:
+        """Return the joints after every layer of the joint decoder; unsolved samples keep theirs."""
+        if self.joint_decoder is None:
+            return []
+        assert seen.evidence is not None
+        kept = solved[:, None, None]
+        start = jnp.where(kept, joints, self._resting_joints())
+        moved = self.joint_decoder(
+            start, seen.evidence, seen.feature_maps, cams, self.config.image_hw, training=mode.training
+        )
+        return [jnp.where(kept, at, joints) for at in moved]
+
+    def _resting_joints(self) -> Float[Array, "21 3"]:
+        """Return the template's joints before the primary camera: joints that span a hand's frame."""
+        template = split_queries(self.template_queries[...], self.config.decoder.query_order)[1]
+        return template + jnp.array(FALLBACK_ROOT, template.dtype)
 
     def _start(self, joints: Array, solved: Array) -> Float[Array, "batch query 3"]:
         """Return the query points before the first layer, metres about the root."""

@@ -201,6 +201,9 @@ class TrainConfig:
     first_stage_steps: int = 0
     """Steps at the beginning that train trunk and heat maps alone, for less than half the cost of a whole
     step: the second stage then starts from joints that mean something. Adam's moments start anew after."""
+    frozen_views: bool = False
+    """What is done with every view alone stays as it is, batch norms included: the second stage learns, for a
+    third of the cost."""
     training_root: TrainingRoot = PAPER_ROOT
     optimizer: OptimizerConfig = OptimizerConfig()
     train: RunConfig = RunConfig()
@@ -219,6 +222,14 @@ class TrainConfig:
         require(
             not self.model.crop.upright,
             "`model.crop.upright` is for models of upright hands; the synthetic captures are not turned",
+        )
+        require(
+            not (self.frozen_views and self.first_stage_steps),
+            f"`first_stage_steps` train what `frozen_views` keeps; got {self.first_stage_steps} of them",
+        )
+        require(
+            not (self.frozen_views and self.optimizer.weight_decay),
+            "`optimizer.weight_decay` would shrink the weights that `frozen_views` keeps; set it to 0",
         )
         require(
             not self.first_stage_steps or self.model.triangulates,

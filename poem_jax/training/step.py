@@ -75,6 +75,7 @@ def train_step(
             config=config.model,
             root_world=root_world,
             train=True,
+            frozen_views=config.frozen_views,
             key=model_key,
             draw_key=draw_key,
             axis_name=axis_name,

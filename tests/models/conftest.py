@@ -19,6 +19,7 @@ from poem_jax.models.config import (
     Design,
     FirstQueries,
     HRNetConfig,
+    JointDecoderConfig,
     RootConfig,
     Similarity,
 )
@@ -71,9 +72,10 @@ def micro_config() -> Config:
 
 @pytest.fixture(scope="session")
 def joints_config() -> Config:
-    """All 21 joints, which also pose the template."""
+    """All 21 joints, which move and then pose the template."""
     decoder = replace(_MICRO.decoder, first_queries=FirstQueries.JOINTS, embed_coordinates=True)
-    return replace(_MICRO, root=RootConfig(num_joints=21), decoder=decoder)
+    moving = JointDecoderConfig(num_layers=1, width=8, num_heads=2, num_blocks=1, picked_features=2)
+    return replace(_MICRO, root=RootConfig(num_joints=21), joint_decoder=moving, decoder=decoder)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from flax import nnx
 
@@ -134,7 +133,7 @@ def test_every_view_matters(config, make_scene):
 
 @pytest.mark.parametrize("count", [VIEWS - 1, VIEWS + 1])
 def test_another_number_of_views_is_refused(config, make_scene, count):
-    with pytest.raises(ValueError, match=rf"takes {VIEWS} views.*got {count}.*view_mask"):
+    with pytest.raises(ValueError, match=rf"must have {VIEWS} views.*got {count}.*pad with masked"):
         run(config, *make_scene(2, count))
 
 
@@ -268,26 +267,6 @@ def test_dropout_draws_from_its_key(config, make_scene):
     first, again, second = (float(learn(made(shallow(config)), *scene, key=key)[0]) for key in (0, 0, 1))
     assert first == again
     assert abs(first - second) > 1e-5
-
-
-def test_training_lowers_a_loss(config, make_scene):
-    images, cams = make_scene(2, VIEWS)
-    graph, weights, rest = nnx.split(Mvp(shallow(config), default_hand(), rngs=nnx.Rngs(0)), nnx.Param, ...)
-    optimiser = optax.adam(3e-3)
-    goal, state, losses = target(cams), optimiser.init(weights), []
-
-    @jax.jit
-    def move(weights: Any, slopes: Any, state: Any) -> Any:
-        steps, state = optimiser.update(slopes, state)
-        return optax.apply_updates(weights, steps), state
-
-    for i in range(30):
-        T, key = jnp.asarray(cams.T_cam_from_world), jax.random.key(i)
-        loss, (slopes, _) = loss_and_slopes(weights, T, graph, rest, images, cams, goal, key)
-        weights, state = move(weights, slopes, state)
-        losses.append(float(loss))
-    assert np.isfinite(losses).all()
-    assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
 
 # Parts.

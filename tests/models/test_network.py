@@ -57,7 +57,9 @@ def test_shapes(model, make_scene):
     assert prediction.vertices_world.shape == (2, 778, 3)
     assert prediction.joints_world.shape == (2, 21, 3)
     assert prediction.layers_world.shape == (2, layers, 799, 3)
-    assert layers == 2
+    config = model.keywords["config"]
+    before = 0 if config.joint_decoder is None else config.joint_decoder.num_layers
+    assert layers == before + config.decoder.num_layers
     assert prediction.keypoints_px.shape[:2] == (2, 4)
     assert prediction.valid.all()
     np.testing.assert_array_equal(prediction.layers_world[:, -1, :778], prediction.vertices_world)

@@ -1,8 +1,12 @@
 """Presets are built abstractly: no weights are drawn."""
 
+import re
+from pathlib import Path
+
 import jax
 import pytest
 
+from poem_jax.models.config import Config
 from poem_jax.models.network import describe
 from poem_jax.models.presets import PRESETS, preset
 
@@ -11,17 +15,17 @@ def _count(tree) -> int:
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
-@pytest.mark.parametrize(
-    ("name", "trainable"),
-    [
-        ("v2-small", 48_311_066),
-        ("v2-base", 51_239_642),
-        ("v2-large", 62_700_122),
-        ("v2-param", 51_001_441),
-    ],
-)
-def test_parameter_counts(name, trainable):
-    assert _count(describe(preset(name))["trainable"]) == trainable
+ROOT = Path(__file__).resolve().parents[2]
+ROW = re.compile(r"^\| \[`([\w-]+)`\]\(#[\w-]+\) \|[^|]+\| ([\d,]+) \|", re.MULTILINE)
+
+
+def test_the_documents_name_every_preset_and_count_its_parameters():
+    """The first table of docs/models.md; and README's list."""
+    rows = dict(ROW.findall((ROOT / "docs" / "models.md").read_text()))
+    counted = {name: f"{_count(describe(config)['trainable']):,}" for name, config in PRESETS.items()}
+    assert rows == counted
+    readme = (ROOT / "README.md").read_text()
+    assert [name for name in PRESETS if f"`{name}`" not in readme] == []
 
 
 def test_tiny_fits_into_the_package():
@@ -31,10 +35,12 @@ def test_tiny_fits_into_the_package():
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_groups_and_layout(name):
-    params = describe(preset(name))
+    config = preset(name)
+    params = describe(config)
     assert set(params) == {"trainable", "statistics", "constants"}
-    assert params["constants"]["basis_points"].shape == (preset(name).basis.num_points, 3)
-    assert params["constants"]["template_queries"].shape == (799, 3)
+    if isinstance(config, Config):
+        assert params["constants"]["basis_points"].shape == (config.basis.num_points, 3)
+        assert params["constants"]["template_queries"].shape == (799, 3)
     assert params["constants"]["hand"]["faces"].shape == (1538, 3)
     for path, _ in jax.tree_util.tree_leaves_with_path(params):
         assert all(isinstance(part, jax.tree_util.DictKey) and isinstance(part.key, str) for part in path)

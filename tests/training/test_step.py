@@ -14,8 +14,17 @@ import numpy as np
 import optax
 import pytest
 
+import poem_jax
 from poem_jax.geometry.cameras import Cameras
-from poem_jax.training.config import RELEASE_ROOT, DataParallel, RootSource, Schedule, TrainingRoot
+from poem_jax.losses import match_keypoints
+from poem_jax.training.config import (
+    RELEASE_ROOT,
+    DataParallel,
+    OptimizerConfig,
+    RootSource,
+    Schedule,
+    TrainingRoot,
+)
 from poem_jax.training.parallel import (
     compile_step,
     data_mesh,
@@ -25,7 +34,7 @@ from poem_jax.training.parallel import (
     stack_for_devices,
 )
 from poem_jax.training.state import create_state, restart_moments
-from poem_jax.training.step import noisy_root, train_step
+from poem_jax.training.step import existing_views, noisy_root, train_step
 
 KEY = jax.random.key(3)
 TOLERANCE = {"rtol": 1e-4, "atol": 1e-6}
@@ -205,3 +214,34 @@ def test_first_stage_trains_the_heat_maps_alone(micro_params, config, micro_batc
     assert all(not leaf.any() for leaf in jax.tree.leaves(first_moments(fresh)))
     counts = optax.tree.get_all_with_path(fresh.opt_state, "count")
     assert sorted(int(count) for _, count in counts) == [0, 1]
+
+
+def test_frozen_views_leave_all_that_looks_at_one_view(micro_params, config, micro_batch):
+    """Weights and batch-norm statistics; and the views look as they do at inference."""
+    frozen = replace(config, frozen_views=True)
+    state = create_state(micro_params, frozen)
+    after, metrics = jax.jit(partial(train_step, config=frozen))(state, micro_batch, KEY)
+    before = jax.tree.map(np.asarray, state.params)
+    looking = ("trunk", "heat_maps", "features")
+    for group, names in (("trainable", looking), ("statistics", before["statistics"])):
+        for name in names:
+            jax.tree.map(np.testing.assert_array_equal, after.params[group][name], before[group][name])
+    moved = jax.tree.map(lambda a, b: np.any(a != b), after.params["trainable"], before["trainable"])
+    assert any(jax.tree.leaves(moved["decoder"]))
+    seen = poem_jax.apply(micro_params, micro_batch.views, existing_views(micro_batch), config=config.model)
+    truth = match_keypoints(seen, micro_batch)
+    mask = existing_views(micro_batch).view_mask
+    error = np.linalg.norm(seen.keypoints_px - truth, axis=-1)[np.asarray(mask)].mean()
+    np.testing.assert_allclose(metrics["keypoint_px"], error, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"first_stage_steps": 3}, "`first_stage_steps` train what `frozen_views` keeps"),
+        ({"optimizer": OptimizerConfig(weight_decay=0.1)}, "would shrink the weights"),
+    ],
+)
+def test_frozen_views_refuse_what_would_move_them(config, change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(config, frozen_views=True, **change)
