@@ -420,6 +420,8 @@ def test_unknown_data_sets_and_counts():
 def test_more_views_than_the_paper_s_convolution_has_weights_for(make_scene):
     with pytest.raises(ValueError, match=r"`views` must have 1 to 5 views.*; got 6"):
         predicted("ftl", *make_scene(1, 6))
+    with pytest.raises(ValueError, match=r"`views` must have 1 to 5 views.*; got 6"):
+        network.forward(params_of("ftl"), *make_scene(1, 6), config=MICRO["ftl"], train=True)
     assert MICRO["ftl-release"].view_range == MICRO["pe"].view_range == (1, None)
 
 

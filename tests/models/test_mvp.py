@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from flax import nnx
 
@@ -55,6 +54,15 @@ PAPER = MvpConfig(
 )
 RELEASE = replace(PAPER, design=Design.RELEASE)
 METRES = 2e-5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compile_fast():
+    """Nearly all that these tests take is compiling."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(params=[PAPER, RELEASE], ids=lambda config: str(config.design))
@@ -268,26 +276,6 @@ def test_dropout_draws_from_its_key(config, make_scene):
     first, again, second = (float(learn(made(shallow(config)), *scene, key=key)[0]) for key in (0, 0, 1))
     assert first == again
     assert abs(first - second) > 1e-5
-
-
-def test_training_lowers_a_loss(config, make_scene):
-    images, cams = make_scene(2, VIEWS)
-    graph, weights, rest = nnx.split(Mvp(shallow(config), default_hand(), rngs=nnx.Rngs(0)), nnx.Param, ...)
-    optimiser = optax.adam(3e-3)
-    goal, state, losses = target(cams), optimiser.init(weights), []
-
-    @jax.jit
-    def move(weights: Any, slopes: Any, state: Any) -> Any:
-        steps, state = optimiser.update(slopes, state)
-        return optax.apply_updates(weights, steps), state
-
-    for i in range(30):
-        T, key = jnp.asarray(cams.T_cam_from_world), jax.random.key(i)
-        loss, (slopes, _) = loss_and_slopes(weights, T, graph, rest, images, cams, goal, key)
-        weights, state = move(weights, slopes, state)
-        losses.append(float(loss))
-    assert np.isfinite(losses).all()
-    assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
 
 # Parts.

@@ -12,8 +12,8 @@ from poem_jax.models import infer as inference
 from poem_jax.models import systems
 from poem_jax.models.apply import _predict, apply, check_inputs, init
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.infer import infer, prepare
-from poem_jax.models.network import describe
+from poem_jax.models.infer import infer, infer_unchecked, prepare
+from poem_jax.models.network import describe, forward
 from poem_jax.models.presets import PRESETS
 from tests import stand_in
 from tests.stand_in import DRAWN_POINTS, GRID_POINTS, StandInConfig
@@ -156,6 +156,10 @@ def test_a_number_of_views_that_the_layers_are_not_made_for(make_scene):
             apply(params, views, cams, config=config)
         with pytest.raises(ValueError, match=f"got {count}"):
             infer(prepare(params, config), views, cams)
+        with pytest.raises(ValueError, match=f"`views` must have 4 views, .* got {count}"):
+            infer_unchecked(prepare(params, config), views, cams)
+        with pytest.raises(ValueError, match=f"`views` must have 4 views, .* got {count}"):
+            forward(params, views, cams, config=config, train=True)
     views, cams = make_scene(3, 4)
     assert apply(params, views, cams._replace(view_mask=MASK), config=config).valid.all()
 

@@ -1,0 +1,414 @@
+"""POEM v1 and its ablations on a micro configuration: laws of the whole, in float64, where no neighbour and
+no basis point hangs on rounding."""
+
+import functools
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from poem_jax.geometry.cameras import Cameras, project
+from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle, transform_points
+from poem_jax.hand.template import default_hand
+from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT, split_queries
+from poem_jax.models.config import Design, FrozenNorms, ResNetConfig, RootConfig, Stem
+from poem_jax.models.detr_config import DetrConfig
+from poem_jax.models.frustum_config import Cuboid, DepthSteps, FrustumConfig
+from poem_jax.models.layers import NormMode
+from poem_jax.models.poem_v1 import PoemV1
+from poem_jax.models.poem_v1_config import (
+    BallConfig,
+    BasisFeatures,
+    OneStageConfig,
+    PoemV1Config,
+    PointDecoderConfig,
+    QueryEmbedding,
+    TokenDecoderConfig,
+)
+from poem_jax.models.poem_v1_release import UnnormalisedAggregation, own_channels, projected_anyhow
+from poem_jax.models.poem_v1_start import LinearMesh
+from poem_jax.models.world_frame import enter_working_frame
+
+METRES = 1e-8
+CUBOID = Cuboid((-0.5, -0.5, 0.2), (0.5, 0.5, 1.0))
+TRUNK = ResNetConfig((1, 1), (8, 16), bottleneck=False, stem=Stem.SPACE_TO_DEPTH, stem_channels=8)
+V1 = PoemV1Config(
+    image_hw=(32, 32),
+    width=24,
+    backbone=TRUNK,
+    basis=BallConfig(48, 0.1, FrustumConfig(4, 0.4, 0.8)),
+    decoder=PointDecoderConfig(num_layers=2, num_neighbours=8, num_heads=2, ffn_expansion=1),
+)
+RELEASE = replace(
+    V1,
+    design=Design.RELEASE,
+    backbone=replace(TRUNK, frozen_norms=FrozenNorms.STAGE_STARTS),
+    first_stage=RootConfig(NUM_JOINTS, design=Design.RELEASE),
+    space=CUBOID,
+    basis=BallConfig(48, 0.2, FrustumConfig(4, 0.4, 0.8, DepthSteps.LINEAR, 0.0)),
+)
+CONFIGS = {
+    "v1": V1,
+    "v1-1stage": replace(V1, first_stage=OneStageConfig((0.0, 0.0, 0.6)), space=CUBOID),
+    "v1-wo-proj": replace(V1, basis_features=BasisFeatures.OWN_CAMERA),
+    "v1-wo-pt": replace(
+        V1, decoder=TokenDecoderConfig(DetrConfig(num_layers=2, num_heads=2, ffn_width=8), CUBOID)
+    ),
+    "release": RELEASE,
+    "release-wo-proj": replace(
+        RELEASE,
+        basis_features=BasisFeatures.OWN_CAMERA,
+        query_embedding=QueryEmbedding.POINT_CODES,
+    ),
+}
+DRAWING = [name for name, config in CONFIGS.items() if config.grid_draw is not None]
+
+
+class Model(NamedTuple):
+    """A model's structure, its random weights, and its one compiled program."""
+
+    graph: Any
+    state: Any
+    run: Any
+
+
+@functools.cache
+def model_of(config: PoemV1Config) -> Model:
+    """Weights are random, so that zero initial ones hide nothing."""
+    rng = np.random.default_rng(0)
+    module = PoemV1(config, default_hand(), rngs=nnx.Rngs(0))
+
+    def draw(path: tuple, leaf: np.ndarray) -> np.ndarray:
+        if path[0] == "hand" or path[-1] == "template" or leaf.dtype.kind != "f":
+            return leaf
+        name = path[-1]
+        if name in ("scale", "variance"):
+            return rng.uniform(0.5, 1.5, leaf.shape)
+        if name in ("points", "table"):
+            return rng.uniform(0.4, 0.6, leaf.shape)
+        fan_in = np.prod(leaf.shape[-4:-1]) if name == "kernel" else 16
+        return rng.normal(size=leaf.shape) / np.sqrt(fan_in)
+
+    graph, state = nnx.split(module)
+    flat = nnx.to_flat_state(state)
+    drawn = [(path, v.replace(jnp.asarray(_as64(draw(path, np.asarray(v.get_value())))))) for path, v in flat]
+    state = nnx.from_flat_state(drawn)
+
+    @jax.jit
+    def run(state, views, frame, ball_index, key):
+        module = nnx.merge(graph, state)
+        return module.find_hands(
+            module.look(views, NormMode()), frame, NormMode(), ball_index=ball_index, key=key
+        )
+
+    return Model(graph, state, run)
+
+
+def _as64(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.float64) if array.dtype.kind == "f" else array
+
+
+def predict(config, views, cams, *, ball_index=None, key=None, root=None):
+    with jax.enable_x64(True):
+        model = model_of(config)
+        frame = enter_working_frame(views, cams, root, np.float64)
+        found = model.run(model.state, np.asarray(views), frame, ball_index, key)
+        return jax.tree.map(np.asarray, found)
+
+
+@pytest.fixture(params=CONFIGS)
+def config(request):
+    return CONFIGS[request.param]
+
+
+@pytest.fixture
+def scene(make_scene):
+    """Two samples of four views; the second view of the second sample is masked."""
+    views, cams = make_scene(2, 4)
+    return views, _masked(cams, [[1, 1, 1, 1], [1, 0, 1, 1]])
+
+
+def _masked(cams, mask):
+    return Cameras(cams.K.astype(np.float64), cams.T_cam_from_world.astype(np.float64), np.array(mask, bool))
+
+
+def _moved_views(views, cams, order):
+    """Put view order[i] of every sample at place i."""
+    return views[:, order], Cameras(*(leaf[:, order] for leaf in cams))
+
+
+def test_prediction_has_what_the_system_has(config, scene):
+    found = predict(config, *scene)
+    layers = found.layers_world
+    assert layers.shape == (2, 2, NUM_QUERIES, 3)
+    assert found.valid.all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    vertices, joints = split_queries(layers[:, -1], config.query_order)
+    np.testing.assert_array_equal(found.vertices_world, vertices)
+    np.testing.assert_array_equal(found.joints_world, joints)
+    has_root = isinstance(config.first_stage, RootConfig)
+    for leaf in (found.root_world, found.keypoints_px, found.heat_maps, found.reference_joints_world):
+        assert (leaf is not None) == has_root
+    if has_root:
+        assert found.keypoints_px.shape == (2, 4, NUM_JOINTS, 2)
+        np.testing.assert_allclose(found.root_world, found.reference_joints_world[:, ROOT_JOINT], atol=1e-9)
+
+
+def test_images_and_layers_matter(config, scene, make_scene):
+    """Guards the tests below against outputs that depend on nothing."""
+    views, cams = scene
+    found, other = predict(config, views, cams), predict(config, make_scene(2, 4, seed=1)[0], cams)
+    assert np.abs(found.layers_world - other.layers_world).max() > 1e-4
+    assert np.abs(found.layers_world[:, 0] - found.layers_world[:, 1]).max() > 1e-5
+
+
+def test_content_and_place_of_masked_views_change_nothing(config, make_scene):
+    views, cams = make_scene(2, 4)
+    expected = predict(config, views, _masked(cams, [[1, 1, 1, 0]] * 2))
+    garbage = views.copy()
+    garbage[:, 3] = 77
+    K, T = cams.K.copy(), cams.T_cam_from_world.copy()
+    K[:, 3], T[:, 3] = np.nan, 0
+    spoilt = _masked(Cameras(K, T), [[1, 1, 1, 0]] * 2)
+    order = [3, 0, 1, 2]
+    for scene in ((garbage, spoilt), _moved_views(garbage, spoilt, order)):
+        found = predict(config, *scene)
+        np.testing.assert_allclose(found.layers_world, expected.layers_world, atol=METRES)
+
+
+def test_prediction_moves_with_the_world(config, scene):
+    views, cams = scene
+    T_new_from_old = rigid(rotation_from_axis_angle(np.array([0.3, -2.0, 1.0])), np.array([0.4, -0.2, 1.0]))
+    moved = cams._replace(T_cam_from_world=cams.T_cam_from_world @ np.linalg.inv(T_new_from_old))
+    expected = transform_points(T_new_from_old, predict(config, views, cams).layers_world)
+    np.testing.assert_allclose(predict(config, views, moved).layers_world, expected, atol=METRES)
+
+
+def test_other_samples_do_not_matter(config, scene, make_scene):
+    views, cams = scene
+    other_views, other_cams = make_scene(2, 4, seed=1)
+    mixed = np.stack([views[0], other_views[1]])
+    mixed_cams = Cameras(*(np.stack([a[0], b[1]]) for a, b in zip(cams, other_cams, strict=True)))
+    expected, found = predict(config, views, cams), predict(config, mixed, mixed_cams)
+    np.testing.assert_allclose(found.layers_world[0], expected.layers_world[0], atol=METRES)
+    assert np.abs(found.layers_world[1] - expected.layers_world[1]).max() > 1e-4
+
+
+def _ball_index(config, views, seed=0):
+    """Any points of the grids, the same in all samples."""
+    draw = config.grid_draw
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.permutation(views * draw.points_per_view)[: draw.num_points]] * 2).astype(np.int32)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_other_views_are_a_set_but_for_the_release(name, make_scene):
+    """With the same basis points, which are numbered by view. The release tells keys the view's number, with
+    or without projection; the paper's models know no numbers."""
+    config = CONFIGS[name]
+    views, cams = make_scene(2, 4)
+    cams = _masked(cams, np.ones((2, 4)))
+    order = [0, 2, 3, 1]
+    index = turned_index = None
+    if config.grid_draw is not None:
+        index, size = _ball_index(config, 4), config.grid_draw.points_per_view
+        turned_index = (np.argsort(order)[index // size] * size + index % size).astype(np.int32)
+    found = predict(config, views, cams, ball_index=index).layers_world
+    turned = predict(config, *_moved_views(views, cams, order), ball_index=turned_index).layers_world
+    if config.design is Design.PAPER:
+        np.testing.assert_allclose(turned, found, atol=METRES)
+    else:
+        assert np.abs(turned - found).max() > 1e-4
+
+
+@pytest.mark.parametrize("name", DRAWING)
+def test_the_key_draws_the_basis_points(name, make_scene):
+    """Which views are first says which points are drawn, too: the paper trains for one order of cameras."""
+    config = CONFIGS[name]
+    views, cams = make_scene(2, 4)
+    cams = _masked(cams, np.ones((2, 4)))
+    default, zero, one = (
+        predict(config, views, cams, key=key).layers_world
+        for key in (None, jax.random.key(0), jax.random.key(1))
+    )
+    np.testing.assert_allclose(default, zero, atol=METRES)
+    assert np.abs(one - zero).max() > 1e-6
+
+
+@pytest.mark.parametrize("name", DRAWING)
+def test_a_ball_without_points_is_not_valid_and_finite(name, scene):
+    config = CONFIGS[name]
+    views, cams = scene
+    far = replace(config.basis, frustum=FrustumConfig(4, 7.0, 8.0))
+    found = predict(replace(config, basis=far), views, cams)
+    assert not found.valid.any()
+    assert np.isfinite(found.layers_world).all()
+
+
+def test_known_root_is_used_where_the_system_has_one(make_scene):
+    views, cams = make_scene(2, 4)
+    cams = _masked(cams, [[1, 0, 0, 0], [1, 1, 1, 1]])
+    root = np.array([[0.01, -0.02, 0.03], [np.nan] * 3])
+    found = predict(V1, views, cams, root=root)
+    assert V1.takes_root
+    assert found.valid.all()
+    np.testing.assert_allclose(found.root_world[0], root[0], atol=1e-9)
+    assert [name for name, config in CONFIGS.items() if not config.takes_root] == [
+        "v1-1stage",
+        "release",
+        "release-wo-proj",
+    ]
+
+
+def test_one_program_for_all_masks(make_scene):
+    views, cams = make_scene(2, 4)
+    masks = ([[1, 1, 0, 1], [0, 1, 1, 0]], [[0, 0, 1, 1], [1, 1, 1, 1]])
+    for config in (V1, RELEASE):
+        predict(config, views, _masked(cams, np.ones((2, 4))))
+        programs = model_of(config).run._cache_size()
+        for mask in masks:
+            predict(config, views, _masked(cams, mask))
+        assert model_of(config).run._cache_size() == programs
+
+
+DEAD = {
+    "release": ("start.shift",),
+    "release-wo-proj": ("start.shift",),
+    "v1-wo-pt": (),
+}
+"""Trained weights that no gradient reaches: the release's layer that moves the ball."""
+
+
+@pytest.mark.parametrize("name", ["v1", "v1-wo-pt", "release"])
+def test_training_has_finite_gradients_everywhere(name, make_scene):
+    config = CONFIGS[name]
+    views, cams = make_scene(2, 2)
+    with jax.enable_x64(True):
+        model = model_of(config)
+        graph, trainable, rest = nnx.split(nnx.merge(model.graph, model.state), nnx.Param, ...)
+        frame = enter_working_frame(views, cams, None, np.float64)
+        mode = NormMode(jnp.ones(4, bool))
+
+        @jax.jit
+        @jax.grad
+        def gradient(trainable):
+            module = nnx.merge(graph, trainable, rest)
+            found = module.find_hands(module.look(views, mode), frame, mode, dropout_key=jax.random.key(0))
+            return jnp.sum(jnp.sin(30 * found.layers_world)) + jnp.sum(found.keypoints_px)
+
+        flat = {
+            ".".join(map(str, path)): np.asarray(leaf.get_value())
+            for path, leaf in nnx.to_flat_state(gradient(trainable))
+        }
+    assert all(np.isfinite(leaf).all() for leaf in flat.values())
+    dead = {path for path, leaf in flat.items() if not leaf.any()}
+    assert dead == {path for path in flat if path.startswith(DEAD.get(name, ()))}
+
+
+GLOBAL, BOTH = QueryEmbedding.GLOBAL, QueryEmbedding.GLOBAL_AND_VERTEX
+
+
+@pytest.mark.parametrize("kind", [GLOBAL, BOTH])
+@pytest.mark.parametrize("design", Design)
+def test_global_features_are_averaged_in_the_paper_and_summed_in_the_release(kind, design):
+    """Of the valid views; and with twice the same view, the paper's embedding is that of one."""
+    by_paper = design is Design.PAPER
+    second = PoemV1(
+        replace(V1 if by_paper else RELEASE, query_embedding=kind), default_hand(), rngs=nnx.Rngs(0)
+    )
+    start = jnp.zeros((1, NUM_QUERIES, 3))
+
+    def embed(pooled, mask):
+        return second.second.embedding(jnp.asarray(pooled), jnp.asarray(mask), *([] if by_paper else [start]))
+
+    pooled = np.random.default_rng(0).normal(size=(1, 3, 16)).astype(np.float32)
+    pooled[:, 2] = pooled[:, 0]
+    one = embed(pooled, [[True, False, False]])
+    assert one.shape == (1, NUM_QUERIES, 24)
+    np.testing.assert_allclose(embed(np.roll(pooled, 1, 1), [[False, True, False]]), one, atol=1e-6)
+    twice = np.abs(embed(pooled, [[True, False, True]]) - one).max()
+    assert twice < 1e-6 if by_paper else twice > 1e-2
+    assert np.abs(embed(pooled, [[False, True, False]]) - one).max() > 1e-2
+
+
+def test_vertices_start_at_the_mean_of_the_joints():
+    joints = np.random.default_rng(0).normal(size=(2, NUM_JOINTS, 3)).astype(np.float32)
+    expected = np.broadcast_to(joints.mean(1, keepdims=True), (2, 778, 3))
+    np.testing.assert_allclose(LinearMesh()(jnp.asarray(joints)), expected, atol=1e-6)
+
+
+def test_one_view_alone_passes_as_phi_of_zero_in_the_release():
+    aggregation = UnnormalisedAggregation(8, rngs=nnx.Rngs(0))
+    aggregation.phi_in.bias[...] = jnp.arange(4.0)
+    features = jnp.asarray(np.random.default_rng(0).normal(size=(1, 3, 5, 8)), jnp.float32)
+    found = aggregation(features, jnp.array([[False, True, False]]))
+    added = aggregation.phi_out(jax.nn.relu(jnp.arange(4.0)))
+    assert np.abs(added).max() > 0.1
+    np.testing.assert_allclose(found, features[:, 1] + added, atol=1e-6)
+
+
+def test_aggregation_of_the_release_is_the_written_sum():
+    aggregation = UnnormalisedAggregation(8, rngs=nnx.Rngs(0))
+    features = np.random.default_rng(0).normal(size=(1, 3, 5, 8)).astype(np.float32)
+    theta = np.asarray(aggregation.theta_out(jax.nn.relu(aggregation.theta_in(jnp.asarray(features)))))
+    mixed = sum((theta[:, 1] * theta[:, j]).sum(-1, keepdims=True) * theta[:, j] for j in (2,))
+    expected = features[:, 1] + aggregation.phi_out(jax.nn.relu(aggregation.phi_in(jnp.asarray(mixed))))
+    found = aggregation(jnp.asarray(features), jnp.array([[False, True, True]]))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_camera_sees_its_own_centre_at_pixel_zero_in_the_release(make_scene):
+    """As the points with which the release fills a ball that holds too few."""
+    cams = make_scene(1, 2)[1]
+    T = cams.T_cam_from_world.copy()
+    T[:, 0] = np.eye(4)
+    points = np.array([[[0.0, 0.0, 0.0], [0.1, -0.2, 0.5]]], np.float32)
+    uv_px = np.asarray(projected_anyhow(Cameras(*map(jnp.asarray, (cams.K, T, cams.view_mask))), points))
+    np.testing.assert_array_equal(uv_px[0, 0, 0], 0)
+    expected, _ = project(cams.K, T, points[:, None])
+    np.testing.assert_allclose(uv_px[0, 0, 1], expected[0, 0, 1], rtol=1e-5)
+    np.testing.assert_allclose(uv_px[0, 1], expected[0, 1], rtol=1e-5)
+
+
+def test_grid_points_own_the_channels_of_their_depth():
+    """A cell's channels are (feature, depth), its points are numbered (view, w, h, depth)."""
+    view, h, w, features, depths = 2, 3, 4, 5, 6
+    maps = np.random.default_rng(0).normal(size=(1, view, h, w, features * depths)).astype(np.float32)
+    places = [(0, 0, 0, 0), (1, 3, 2, 5), (1, 0, 2, 1), (0, 3, 0, 4)]
+    index = [np.ravel_multi_index(place, (view, w, h, depths)) for place in places]
+    found = own_channels(jnp.asarray(maps), depths, jnp.array([[*index, -1]]))
+    expected = [maps[0, v, y, x].reshape(features, depths)[:, d] for v, x, y, d in places]
+    np.testing.assert_array_equal(found[0], [*expected, np.zeros(features)])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"first_stage": OneStageConfig()}, "one stage needs"),
+        ({"first_stage": RootConfig(1)}, "21 joints"),
+        ({"design": Design.RELEASE}, "`first_stage` must have 21 joints and the `design`"),
+        ({"query_embedding": QueryEmbedding.POINTS}, "points needs `design` = release"),
+        ({"width": 20}, "multiple of 4 x `num_heads`"),
+        (
+            {"basis": BallConfig(1000, 0.1, FrustumConfig(4, 0.4, 0.8))},
+            "64 grid points of one view; got 1000",
+        ),
+        ({"image_hw": (36, 36)}, "coarsest stride"),
+    ],
+)
+def test_bad_configs_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(V1, **change)
+
+
+def test_released_embedding_and_features_go_together():
+    with pytest.raises(ValueError, match="go together"):
+        replace(RELEASE, basis_features=BasisFeatures.OWN_CAMERA)
+    with pytest.raises(ValueError, match="needs a cuboid"):
+        replace(
+            RELEASE, decoder=TokenDecoderConfig(DetrConfig(2, 2, 8)), query_embedding=QueryEmbedding.VERTEX
+        )
