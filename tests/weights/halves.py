@@ -14,7 +14,7 @@ from flax import nnx
 
 from poem_jax.batch import Prediction
 from poem_jax.geometry.neighbours import nearest
-from poem_jax.models import aggregation, decoder, heat_maps, layers, network, point_features, vector_attention
+from poem_jax.models import aggregation, decoder, heat_maps, layers, poem_v2, point_features, vector_attention
 from poem_jax.models.backbones import HRNet
 from poem_jax.models.config import Config
 from poem_jax.models.network import assemble
@@ -38,7 +38,7 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
     "pooled": (heat_maps, "max_pool", _whole),
     "position": (point_features.ViewRowColumnCode, "__call__", _whole),
     "axis_codes": (point_features, "axis_code", _whole),
-    "sampled": (network, "projected_features", lambda args, out: (out[0][:, :, ::128], out[1])),
+    "sampled": (poem_v2, "projected_features", lambda args, out: (out[0][:, :, ::128], out[1])),
     "tokens": (aggregation, "row_major_tokens", lambda args, out: out[:, :, ::128]),
     "basis_features": (aggregation.ProjectiveAggregation, "__call__", lambda args, out: out[:, ::64]),
     "embedded": (
