@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.geometry import neighbours
 from poem_jax.geometry.neighbours import gather, nearest
 
 nearest_jit = jax.jit(nearest, static_argnums=2)
@@ -62,3 +63,9 @@ def test_gather_takes_rows(rng, batch):
 def test_gather_gradients_and_search_without(rng, check_gradients):
     points = rng.normal(size=(64, 3))
     check_gradients(lambda p: gather(p, nearest(p[:5], p, 2)), points)
+
+
+def test_many_queries_are_searched_part_by_part(rng, monkeypatch):
+    monkeypatch.setattr(neighbours, "_QUERIES_AT_A_TIME", 8)
+    queries, points = (rng.normal(size=(2, 3, n, 3)).astype(np.float32) for n in (24, 50))
+    np.testing.assert_array_equal(nearest(queries, points, 5), _naive(queries, points, 5))

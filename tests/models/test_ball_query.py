@@ -65,7 +65,7 @@ def test_masked_views_are_not_drawn_and_change_nothing(grid):
 
 
 def test_what_a_ball_lacks_is_told_and_repeated(grid):
-    few = BallConfig(40, 0.2, FrustumConfig(4))
+    few = BallConfig(40, 0.3, FrustumConfig(4))
     ball = _draw(grid, config=few)
     count = int(ball.count[0])
     assert 0 < count < 40

@@ -17,8 +17,10 @@ from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT, split_queries
 from poem_jax.models.config import Design, FrozenNorms, ResNetConfig, RootConfig, Stem
 from poem_jax.models.detr_config import DetrConfig
+from poem_jax.models.frustum import frustum_grid
 from poem_jax.models.frustum_config import Cuboid, DepthSteps, FrustumConfig
 from poem_jax.models.layers import NormMode
+from poem_jax.models.network import forward, leaves_with_names, split
 from poem_jax.models.poem_v1 import PoemV1
 from poem_jax.models.poem_v1_config import (
     BallConfig,
@@ -30,7 +32,7 @@ from poem_jax.models.poem_v1_config import (
     TokenDecoderConfig,
 )
 from poem_jax.models.poem_v1_release import UnnormalisedAggregation, own_channels, projected_anyhow
-from poem_jax.models.poem_v1_start import LinearMesh
+from poem_jax.models.poem_v1_start import LinearMesh, Start
 from poem_jax.models.world_frame import enter_working_frame
 
 METRES = 1e-8
@@ -76,6 +78,15 @@ class Model(NamedTuple):
     run: Any
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compile_fast():
+    """Nearly all that these tests take is compiling."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @functools.cache
 def model_of(config: PoemV1Config) -> Model:
     """Weights are random, so that zero initial ones hide nothing."""
@@ -116,6 +127,7 @@ def predict(config, views, cams, *, ball_index=None, key=None, root=None):
     with jax.enable_x64(True):
         model = model_of(config)
         frame = enter_working_frame(views, cams, root, np.float64)
+        key = jax.random.key(0) if key is None else key
         found = model.run(model.state, np.asarray(views), frame, ball_index, key)
         return jax.tree.map(np.asarray, found)
 
@@ -205,10 +217,10 @@ def _ball_index(config, views, seed=0):
     return np.stack([rng.permutation(views * draw.points_per_view)[: draw.num_points]] * 2).astype(np.int32)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["v1", "v1-wo-proj", "v1-wo-pt", "release"])
 def test_other_views_are_a_set_but_for_the_release(name, make_scene):
-    """With the same basis points, which are numbered by view. The release tells keys the view's number, with
-    or without projection; the paper's models know no numbers."""
+    """With the same basis points, which are numbered by view: which are drawn depends on the views' order.
+    The release tells features the view's number; the paper's models know no numbers."""
     config = CONFIGS[name]
     views, cams = make_scene(2, 4)
     cams = _masked(cams, np.ones((2, 4)))
@@ -226,27 +238,35 @@ def test_other_views_are_a_set_but_for_the_release(name, make_scene):
 
 
 @pytest.mark.parametrize("name", DRAWING)
-def test_the_key_draws_the_basis_points(name, make_scene):
-    """Which views are first says which points are drawn, too: the paper trains for one order of cameras."""
-    config = CONFIGS[name]
-    views, cams = make_scene(2, 4)
-    cams = _masked(cams, np.ones((2, 4)))
-    default, zero, one = (
-        predict(config, views, cams, key=key).layers_world
-        for key in (None, jax.random.key(0), jax.random.key(1))
-    )
-    np.testing.assert_allclose(default, zero, atol=METRES)
+def test_the_key_draws_the_basis_points(name, scene):
+    zero, one = (predict(CONFIGS[name], *scene, key=jax.random.key(i)).layers_world for i in (0, 1))
     assert np.abs(one - zero).max() > 1e-6
 
 
-@pytest.mark.parametrize("name", DRAWING)
+def test_without_a_key_it_is_key_0(make_scene):
+    module = PoemV1(V1, default_hand(), rngs=nnx.Rngs(0))
+    cams = Cameras(*map(jnp.asarray, make_scene(1, 4)[1]))
+    grid = frustum_grid(V1.basis.frustum, cams, V1.map_hw, V1.image_hw)
+    centre = jnp.mean(grid, (1, 2, 3, 4))
+    start = Start(jnp.zeros((1, NUM_QUERIES, 3)), centre, None, None, jnp.ones(1, bool))
+    default, zero, one = (
+        module._basis(None, grid, start, cams, key).index
+        for key in (None, jax.random.key(0), jax.random.key(1))
+    )
+    np.testing.assert_array_equal(default, zero)
+    assert (np.asarray(default) != np.asarray(one)).any()
+
+
+@pytest.mark.parametrize("name", ["v1", "release"])
 def test_a_ball_without_points_is_not_valid_and_finite(name, scene):
-    config = CONFIGS[name]
+    """The hand is ten times as far as the grids reach."""
     views, cams = scene
-    far = replace(config.basis, frustum=FrustumConfig(4, 7.0, 8.0))
-    found = predict(replace(config, basis=far), views, cams)
+    T = cams.T_cam_from_world.copy()
+    T[..., :3, 3] *= 10
+    found = predict(CONFIGS[name], views, cams._replace(T_cam_from_world=T))
     assert not found.valid.any()
     assert np.isfinite(found.layers_world).all()
+    assert (np.abs(found.reference_joints_world).max((1, 2)) > 0).all()
 
 
 def test_known_root_is_used_where_the_system_has_one(make_scene):
@@ -255,8 +275,8 @@ def test_known_root_is_used_where_the_system_has_one(make_scene):
     root = np.array([[0.01, -0.02, 0.03], [np.nan] * 3])
     found = predict(V1, views, cams, root=root)
     assert V1.takes_root
-    assert found.valid.all()
-    np.testing.assert_allclose(found.root_world[0], root[0], atol=1e-9)
+    assert found.valid[1]
+    np.testing.assert_allclose(found.root_world[0], root[0], atol=1e-6)
     assert [name for name, config in CONFIGS.items() if not config.takes_root] == [
         "v1-1stage",
         "release",
@@ -275,38 +295,28 @@ def test_one_program_for_all_masks(make_scene):
         assert model_of(config).run._cache_size() == programs
 
 
-DEAD = {
-    "release": ("start.shift",),
-    "release-wo-proj": ("start.shift",),
-    "v1-wo-pt": (),
-}
-"""Trained weights that no gradient reaches: the release's layer that moves the ball."""
-
-
-@pytest.mark.parametrize("name", ["v1", "v1-wo-pt", "release"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["v1", "release"])
 def test_training_has_finite_gradients_everywhere(name, make_scene):
+    """But in the release's layer that moves the ball, which no gradient reaches, and in biases that the
+    softmax takes away."""
     config = CONFIGS[name]
     views, cams = make_scene(2, 2)
     with jax.enable_x64(True):
         model = model_of(config)
-        graph, trainable, rest = nnx.split(nnx.merge(model.graph, model.state), nnx.Param, ...)
-        frame = enter_working_frame(views, cams, None, np.float64)
-        mode = NormMode(jnp.ones(4, bool))
+        params = split(nnx.merge(model.graph, model.state))
 
         @jax.jit
         @jax.grad
         def gradient(trainable):
-            module = nnx.merge(graph, trainable, rest)
-            found = module.find_hands(module.look(views, mode), frame, mode, dropout_key=jax.random.key(0))
+            found, _ = forward({**params, "trainable": trainable}, views, cams, config=config, train=True)
             return jnp.sum(jnp.sin(30 * found.layers_world)) + jnp.sum(found.keypoints_px)
 
-        flat = {
-            ".".join(map(str, path)): np.asarray(leaf.get_value())
-            for path, leaf in nnx.to_flat_state(gradient(trainable))
-        }
+        flat = leaves_with_names(jax.tree.map(np.asarray, gradient(params["trainable"])))
     assert all(np.isfinite(leaf).all() for leaf in flat.values())
     dead = {path for path, leaf in flat.items() if not leaf.any()}
-    assert dead == {path for path in flat if path.startswith(DEAD.get(name, ()))}
+    expected = {p for p in flat if p.startswith("start.shift") or p.endswith("gamma_out.bias")}
+    assert dead == expected
 
 
 GLOBAL, BOTH = QueryEmbedding.GLOBAL, QueryEmbedding.GLOBAL_AND_VERTEX
