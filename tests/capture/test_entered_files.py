@@ -10,8 +10,7 @@ from poem_jax.capture.pipeline import reconstruct
 from poem_jax.capture.take import read_take
 
 PACKAGE = Path(poem_jax.__file__).parent
-MAX_FILES = 26
-"""25 until the joint decoder came, which is one file."""
+MAX_FILES = 25
 
 
 def test_reconstruct_enters_few_files_of_capture_and_models(tmp_path):

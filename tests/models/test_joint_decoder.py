@@ -15,8 +15,8 @@ from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT, QueryOrder, split_queries
 from poem_jax.models.config import FirstQueries, JointDecoderConfig
+from poem_jax.models.decoder import JointDecoder, cloud, read_evidence
 from poem_jax.models.hand_output import template_queries
-from poem_jax.models.joint_decoder import JointDecoder, cloud, read_evidence
 from poem_jax.models.network import forward
 from poem_jax.models.point_features import evidence
 
