@@ -19,10 +19,9 @@ from poem_jax.hand.topology import join_queries
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import HRNet, ResNet
 from poem_jax.models.config import Config, DecoderOutput, Design, FirstQueries, HRNetConfig
-from poem_jax.models.decoder import Decoder, Surroundings
+from poem_jax.models.decoder import Decoder, JointDecoder, Surroundings
 from poem_jax.models.hand_output import ParameterRegressor, draw_in, first_queries, root_relative_mesh
 from poem_jax.models.heat_maps import HeatMapBranch, root_point, triangulate_joints
-from poem_jax.models.joint_decoder import JointDecoder
 from poem_jax.models.layers import NormMode, trunk_images
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.point_features import (

@@ -60,12 +60,14 @@ def test_its_second_stage_gains_on_the_first(errors) -> None:
 
 @pytest.mark.slow
 def test_more_views_are_better(captures) -> None:
-    """On 200 captures, as the README's table counts them."""
+    """On 200 captures, as the README's table counts them. One view triangulates no joint, so that what it
+    gains on the resting template (the mean hand's 58 mm) is the work of the decoder of all points alone."""
     config, params = shipped()
-    settings = BenchmarkSettings(views=(2, 4, 8), samples=200, seed=SEED, progress=False)
+    settings = BenchmarkSettings(views=(1, 2, 4, 8), samples=200, seed=SEED, progress=False)
     scores = run_benchmark(model_predictor(params, config), captures, settings)
-    means = [scores[n]["mpvpe_mm"] for n in (2, 4, 8)]
+    means = [scores[n]["mpvpe_mm"] for n in (1, 2, 4, 8)]
     print(means)
     assert np.all(np.diff(means) < 0)
-    assert means[1] <= MAX_MPVPE_MM + 0.2
-    assert means[1] <= scores[4]["mean_pose_mpvpe_mm"] / 7
+    assert means[0] <= 26
+    assert means[2] <= MAX_MPVPE_MM + 0.2
+    assert means[2] <= scores[4]["mean_pose_mpvpe_mm"] / 7

@@ -16,7 +16,7 @@ from poem_jax.hand.model import template_queries
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT, QueryOrder, split_queries
 from poem_jax.models.config import FirstQueries, JointDecoderConfig
-from poem_jax.models.joint_decoder import JointDecoder, cloud, read_evidence
+from poem_jax.models.decoder import JointDecoder, cloud, read_evidence
 from poem_jax.models.network import forward
 from poem_jax.models.point_features import evidence
 
