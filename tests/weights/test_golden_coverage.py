@@ -23,6 +23,7 @@ from tests.weights import (
     test_v1_import,
     test_v1_mesh_parity,
     test_v1_mvp_parity,
+    test_v1_poem_parity,
 )
 from tests.weights.procedural import REFERENCE, needs_reference
 
@@ -115,14 +116,12 @@ V1_INPUTS = {"inputs_a.npz", "inputs_b.npz", "metrics.json", "float32_noise.json
 """Of the runs of the networks; the last holds what the goldens themselves are worth."""
 V1_INPUT_SETS = {"mvp4": "a", "mvp8": "b"}
 """Networks that are tied to a number of cameras; the others ran on both sets."""
-V1_POEM = {name for name in V1_NETWORKS if name.startswith("poem")}
-"""POEM v1 and its ablations: `test_v1_import` compares what comes out; their stages are not compared yet."""
 
 
 def v1_compared() -> dict[str, set[str]]:
-    """List the arrays of each file that the tests of the baselines compare."""
+    """List the arrays of each file that the tests of POEM v1 and the baselines compare."""
     keys: dict[str, set[str]] = {}
-    for case, key, _ in test_v1_mesh_parity.COMPARED:
+    for case, key, _ in (*test_v1_poem_parity.COMPARED, *test_v1_mesh_parity.COMPARED):
         keys.setdefault(f"golden_{case}", set()).add(key)
     for model, checks in test_v1_mvp_parity.COMPARED.items():
         keys[f"golden_{model}_{test_v1_mvp_parity.CASES[model]}"] = set(checks)
@@ -161,7 +160,7 @@ def test_the_files_of_v1_are_known() -> None:
 
 def test_the_arrays_of_the_networks_of_v1_are_compared() -> None:
     compared = v1_compared()
-    assert compared.keys() == v1_goldens(V1_NETWORKS - V1_POEM)
+    assert compared.keys() == v1_goldens(V1_NETWORKS)
     for name, keys in compared.items():
         with np.load(V1 / f"{name}.npz") as arrays:
             assert keys == set(arrays.files), name
