@@ -7,7 +7,7 @@ written before the exception goes on its way.
 import functools
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 
 from poem_jax.capture.frame import Frame
-from poem_jax.capture.lens import project_raw
-from poem_jax.capture.page_pictures import PageFrames, make_gallery, page_frame
+from poem_jax.capture.lens import PictureMap, picture_map, project_raw, take_picture
 from poem_jax.capture.report import Clock, Report
 from poem_jax.capture.take import Take
+from poem_jax.geometry.distortion import undistort_pixels
+from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.transforms import rigid, smallest_rotation
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
 from poem_jax.io.animated_glb import AnimatedGlb
 from poem_jax.io.atomic import whole_file
@@ -27,12 +29,18 @@ from poem_jax.io.growing_npz import GrowingNpz
 from poem_jax.io.meshes import is_own_mesh, write_mesh
 from poem_jax.typing import Array, Float, Int, UInt8
 from poem_jax.viz.overlay import MeshInView, draw_overlay
-from poem_jax.viz.page import HAND_RGB, write_page
+from poem_jax.viz.page import HAND_RGB, PageCamera, PageFrame, write_page
 
 MESH_SUFFIXES = (".glb", ".obj")
 PREDICTION, REPORT, PAGE, ANIMATION = "prediction.npz", "report.json", "index.html", "hands.glb"
 SECONDS_PER_FRAME = 1 / 30
 """Of the animation: what video cameras take; a capture does not say."""
+PAGE_FRAMES = 120
+"""A take with more frames that hold a hand is thinned out evenly for the page."""
+_LONG_TAKE = 20
+_PAGE_PICTURE_PX = 320
+_PAGE_PICTURE_PX_OF_LONG_TAKES = 200
+
 
 _SHAPES = {
     "joints_world": (NUM_JOINTS, 3),
@@ -291,3 +299,65 @@ def write_png(path: Path, image: UInt8[Array, "h w 3"]) -> Path:
             raise OSError(f"cannot encode {path} as PNG")
         temporary.write_bytes(data.tobytes())
     return path
+
+
+class Gallery(NamedTuple):
+    """The small ideal cameras whose pictures the page shows at the places of a rig's cameras."""
+
+    cameras: list[PageCamera]
+    maps: list[PictureMap]
+
+
+def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
+    """Prepare the page's pictures; those of a take that is long, or may be (None), are smaller."""
+    short = num_frames is not None and num_frames <= _LONG_TAKE
+    longer = _PAGE_PICTURE_PX if short else _PAGE_PICTURE_PX_OF_LONG_TAKES
+    pairs = [_page_camera(rig, view, longer) for view in range(rig.num_views)]
+    return Gallery([camera for camera, _ in pairs], [where for _, where in pairs])
+
+
+class PageFrames:
+    """The frames of a page, gathered while a take goes by: those with a hand, thinned out evenly."""
+
+    def __init__(self) -> None:
+        self.kept: list[PageFrame] = []
+        self._every = 1
+        self._offered = 0
+
+    def offer(self, make: Callable[[], PageFrame]) -> None:
+        """Count a frame that holds a hand; make and keep it if its turn has come."""
+        if self._offered % self._every == 0:
+            self.kept.append(make())
+        self._offered += 1
+        if len(self.kept) > PAGE_FRAMES:
+            self.kept = self.kept[::2]
+            self._every *= 2
+
+
+def page_frame(
+    name: str,
+    vertices_world: Mapping[str, Float[Array, "vert 3"]],
+    images: Sequence[Array | None],
+    gallery: Gallery,
+) -> PageFrame:
+    """Make a frame of the page: the hands by name, and small undistorted pictures."""
+    views = zip(images, gallery.maps, strict=True)
+    pictures = [None if image is None else take_picture(image, at) for image, at in views]
+    return PageFrame(name, vertices_world, pictures)
+
+
+def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureMap]:
+    """Make a pinhole with a central axis that looks at the middle of a photograph, whose own axis may not."""
+    K, dist = rig.K[view], rig.dist[view]
+    width, height = (int(size) for size in rig.size_wh[view])
+    x, y = undistort_pixels(np.array([[width / 2, height / 2]]), K, dist)[0]
+    ray = np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
+    R_cam_from_picture = smallest_rotation(np.array([0.0, 0.0, 1.0]), ray)
+    scale = longer / max(width, height)
+    # Off its axis an image is stretched by the squared length of the ray.
+    focal_px = float(scale * (K[0, 0] + K[1, 1]) / 2 * (ray @ ray))
+    hw = (round(scale * height), round(scale * width))
+    K_picture = np.array([[focal_px, 0, hw[1] / 2], [0, focal_px, hw[0] / 2], [0, 0, 1]])
+    T_picture_from_world = rigid(R_cam_from_picture.T, np.zeros(3)) @ rig.T_cam_from_world[view]
+    where = picture_map(K, dist, K_picture, hw, 1 / scale, R_cam_from_picture)
+    return PageCamera(rig.names[view], T_picture_from_world, focal_px, hw), where

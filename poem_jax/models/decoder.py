@@ -403,7 +403,7 @@ class JointLayer(nnx.Module):
         self.embed = nnx.Param(normal(rngs.params(), (NUM_JOINTS, numbers, config.width), numbers**-0.5))
         self.names = nnx.Param(normal(rngs.params(), (NUM_JOINTS, config.width), _EMBEDDING_SCALE))
         self.blocks = nnx.List(JointBlock(config, rngs=rngs) for _ in range(config.num_blocks))
-        self.norm = layer_norm(config.width, _PAPER_EPSILON, rngs=rngs)
+        self.norm = layer_norm(config.width, PAPER_EPSILON, rngs=rngs)
         self.offset = nnx.Linear(config.width, 3, kernel_init=nnx.initializers.zeros, rngs=rngs)
 
     def __call__(self, tokens: Float[Array, "batch 21 number"]) -> Float[Array, "batch 21 3"]:
@@ -421,7 +421,7 @@ class JointBlock(nnx.Module):
         width, hidden = config.width, config.ffn_expansion * config.width
         self.attention = MultiHeadAttention(width, config.num_heads, rngs=rngs)
         self.before_attention, self.before_hidden = (
-            layer_norm(width, _PAPER_EPSILON, rngs=rngs) for _ in range(2)
+            layer_norm(width, PAPER_EPSILON, rngs=rngs) for _ in range(2)
         )
         self.hidden, self.out = linear(width, hidden, rngs=rngs), linear(hidden, width, rngs=rngs)
 

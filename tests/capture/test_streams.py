@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import Prediction
-from poem_jax.capture import agreement, page_pictures
+from poem_jax.capture import agreement, write
 from poem_jax.capture.network import Network
 from poem_jax.capture.pipeline import reconstruct
 from poem_jax.capture.take import read_take
@@ -60,7 +60,7 @@ def frames_of(path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_take(make_capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(page_pictures, "PAGE_FRAMES", 2)
+    monkeypatch.setattr(write, "PAGE_FRAMES", 2)
     monkeypatch.setattr(agreement, "_WINDOW", 8)
     take = read_take(make_capture().folder)
     held = {}

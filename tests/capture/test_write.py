@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from poem_jax.capture import page_pictures, write
+from poem_jax.capture import write
 from poem_jax.capture.boxes_file import write_boxes
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.write import frame_folder, prediction_entry
@@ -13,7 +13,7 @@ def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
     make_capture, tmp_path, run, monkeypatch
 ):
     pages = []
-    monkeypatch.setattr(page_pictures, "PAGE_FRAMES", 2)
+    monkeypatch.setattr(write, "PAGE_FRAMES", 2)
     monkeypatch.setattr(write, "write_page", lambda path, frames, *_: pages.append(frames) or path)
     capture = make_capture(7)
     capture.hands.boxes_px[::2] = np.nan

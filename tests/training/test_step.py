@@ -232,7 +232,7 @@ def test_frozen_views_leave_all_that_looks_at_one_view(micro_params, config, mic
     moved = jax.tree.map(lambda a, b: np.any(a != b), after.params["trainable"], before["trainable"])
     assert any(jax.tree.leaves(moved["decoder"]))
     seen = poem_jax.apply(micro_params, micro_batch.views, existing_views(micro_batch), config=config.model)
-    truth = match_keypoints(seen, micro_batch)
+    truth = match_keypoints(seen.keypoints_px, micro_batch)
     mask = existing_views(micro_batch).view_mask
     error = np.linalg.norm(seen.keypoints_px - truth, axis=-1)[np.asarray(mask)].mean()
     np.testing.assert_allclose(metrics["keypoint_px"], error, rtol=1e-4)
