@@ -4,16 +4,19 @@
 fixed size for the trunk, which is most of the work, and the hand is then found sample by sample, so that the
 cost follows the views that there are. All shapes are fixed by the padded batch: new masks compile nothing.
 
-On a CPU a chunk is one view, and as many threads as cores each run a program that uses one thread: XLA:CPU
-shares a single convolution badly among cores. Programs for few and for many parts differ, so that a padded
-batch compiles at most two of each half. Accelerators take the chunks one after the other; nothing was
-measured there.
+On a CPU a chunk is two views, which read the weights once, or one, and as many threads as cores each run a
+program that uses one thread: XLA:CPU shares a single convolution badly among cores. Programs for few and for
+many parts differ, and those for one and two views, so that a padded batch compiles at most three of the first
+half and two of the second. Accelerators take the chunks one after the other; nothing was measured there.
 """
 
 import contextlib
 import functools
+import itertools
+import math
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -21,6 +24,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras
@@ -28,7 +33,7 @@ from poem_jax.io.compiler_options import cpu_options
 from poem_jax.models import network
 from poem_jax.models.apply import check_inputs, check_solved
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.layers import NormMode
+from poem_jax.models.layers import Conv, NormMode
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame, is_traced
 from poem_jax.typing import Array, Float, Int, Num, Params, PRNGKeyArray, PyTree
 
@@ -44,6 +49,7 @@ class Prepared:
     """A model ready for inference: its parameters, and what does not depend on the images."""
 
     params: Params
+    """Those given, but on a CPU with kernels of wide convolutions transformed (`winograd.py`)."""
     constant: dict[str, PyTree] | None
     """Arguments of `find_hands` that do not depend on the images, if the system has any."""
     config: ModelConfig
@@ -56,7 +62,33 @@ def prepare(params: Params, config: ModelConfig) -> Prepared:
         ValueError: `params` of another config.
     """
     network.check_params(config, params)
-    return jax.device_put(Prepared(params, _constant(params, config), config))
+    prepared = _with_transformed_kernels(params, config) if _on_cpu() else params
+    return jax.device_put(Prepared(prepared, _constant(params, config), config))
+
+
+def _with_transformed_kernels(params: Params, config: ModelConfig) -> Params:
+    """Prepare the convolutions that look at the views, each for the smallest map that its shape sees."""
+    images = jax.ShapeDtypeStruct((1, *config.image_hw, 3), np.uint8)
+    program = jax.make_jaxpr(_look)(Prepared(params, None, config), images)
+    pixels: dict[tuple[int, ...], int] = {}
+    for x, kernel in _convolutions(program.jaxpr):
+        pixels[kernel] = min(math.prod(x[1:3]), pixels.get(kernel, sys.maxsize))
+    model = network.assemble(config, params)
+    for _, part in nnx.iter_graph(model):
+        if isinstance(part, Conv):
+            part.prepare_for_cpu(pixels.get(part.kernel[...].shape[-4:], 0))
+    return network.split(model)
+
+
+def _convolutions(program: Jaxpr) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """List the shapes of images and kernel of every convolution in a program."""
+    for step in program.eqns:
+        if step.primitive.name == "conv_general_dilated":
+            x, kernel = (variable.aval for variable in step.invars)
+            yield x.shape, kernel.shape  # pyright: ignore[reportAttributeAccessIssue]
+        for inner in step.params.values():
+            if isinstance(inner, ClosedJaxpr | Jaxpr):
+                yield from _convolutions(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
 
 
 def infer(
@@ -121,15 +153,23 @@ def _infer_in_frame(prepared: Prepared, views: Array, frame: WorkingFrame, draw:
 def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> PyTree:
     """Run the trunk over the valid views, chunk by chunk; masked views get zeros."""
     packed = views[valid]
-    chunk = 1 if _on_cpu() else _VIEWS_AT_A_TIME
-    missing = -len(packed) % chunk
-    packed = np.concatenate([packed, np.zeros((missing, *packed.shape[1:]), packed.dtype)])
-    chunks = [packed[start : start + chunk] for start in range(0, len(packed), chunk)]
-    buffers = _empty_features(prepared, views.dtype, valid.size + chunk)
-    for i, seen in enumerate(_run_all(_look, prepared, chunks)):
-        buffers = _write(buffers, seen, i * chunk)
+    sizes = _chunk_sizes(len(packed))
+    packed = np.concatenate([packed, np.zeros((sum(sizes) - len(packed), *packed.shape[1:]), packed.dtype)])
+    starts = [0, *itertools.accumulate(sizes)]
+    buffers = _empty_features(prepared, views.dtype, valid.size + max(sizes, default=1))
+    chunks = [packed[start:end] for start, end in itertools.pairwise(starts)]
+    for seen, start in zip(_run_all(_look, prepared, chunks), starts[:-1], strict=True):
+        buffers = _write(buffers, seen, start)
     place = np.where(valid, np.cumsum(valid).reshape(valid.shape) - 1, valid.size)
     return _read(buffers, place)
+
+
+def _chunk_sizes(count: int) -> list[int]:
+    """Divide views into chunks: on a CPU pairs, as long as there is one for every core, then single ones."""
+    if not _on_cpu():
+        return [_VIEWS_AT_A_TIME] * -(-count // _VIEWS_AT_A_TIME)
+    pairs = count // (2 * _cores()) * _cores()
+    return [2] * pairs + [1] * (count - 2 * pairs)
 
 
 class _Samples(NamedTuple):

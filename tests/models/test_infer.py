@@ -117,9 +117,12 @@ def test_a_moved_heat_map_moves_the_features_at_its_place(micro_config, make_par
 
 def test_only_views_and_samples_that_exist_cost_anything(micro_config, make_params, make_scene, monkeypatch):
     seen, inner = [], inference._run_all
-    monkeypatch.setattr(
-        inference, "_run_all", lambda f, prepared, parts: seen.append(len(parts)) or inner(f, prepared, parts)
-    )
+
+    def counted(function, prepared, parts):
+        seen.append(sum(map(len, parts)) if function is inference._look else len(parts))
+        return inner(function, prepared, parts)
+
+    monkeypatch.setattr(inference, "_run_all", counted)
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
     mask = MASK & np.array([[True], [False], [True]])
@@ -162,7 +165,8 @@ def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkey
     monkeypatch.setattr(inference, "_cores", lambda: 2)
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
-    infer(prepared, views, cams._replace(view_mask=MASK))
+    # Seven views: two pairs and three single ones.
+    infer(prepared, views, cams._replace(view_mask=np.arange(12).reshape(3, 4) % 5 > 1))
     halves = (inference._look, inference._find)
     jitted = [inference._cpu_program(half, alone) for half in halves for alone in (True, False)]
     jitted += [inference._look, inference._find, inference._write, inference._read]
@@ -170,6 +174,16 @@ def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkey
     for mask in (~MASK | np.array([True, True, False, False]), np.ones((3, 4), bool)):
         infer(prepared, views, cams._replace(view_mask=mask))
     assert [program._cache_size() for program in jitted] == before
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 16])
+def test_pairs_of_views_never_leave_a_core_without_work(cores, monkeypatch):
+    monkeypatch.setattr(inference, "_cores", lambda: cores)
+    for count in range(40):
+        sizes = inference._chunk_sizes(count)
+        assert sum(sizes) == count
+        assert sizes.count(2) % cores == 0
+        assert sizes.count(1) < 2 * cores
 
 
 def test_single_views_take_their_known_root(micro_config, make_params, make_scene):

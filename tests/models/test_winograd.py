@@ -1,0 +1,70 @@
+"""Minimal filtering against the plain sum over windows, and where inference uses it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from poem_jax.models import winograd
+from poem_jax.models.layers import Conv
+
+
+def plain(x, kernel):
+    return jax.lax.conv_general_dilated(
+        x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+
+
+def drawn(shape, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape))
+
+
+@pytest.mark.parametrize("hw", [(8, 6), (7, 9), (1, 2), (3, 1)])
+def test_it_is_the_convolution_whatever_the_size(hw):
+    with jax.enable_x64(True):
+        x, kernel = drawn((2, *hw, 5)), drawn((3, 3, 5, 4), 1)
+        np.testing.assert_allclose(
+            winograd.convolve(x, winograd.transformed(kernel)), plain(x, kernel), atol=1e-12
+        )
+
+
+def test_its_gradients_are_those_of_the_convolution():
+    with jax.enable_x64(True):
+        x, kernel, weights = drawn((2, 7, 6, 5)), drawn((3, 3, 5, 4), 1), drawn((2, 7, 6, 4), 2)
+
+        def by_filtering(x, kernel):
+            return jnp.sum(weights * winograd.convolve(x, winograd.transformed(kernel)) ** 2)
+
+        def by_convolution(x, kernel):
+            return jnp.sum(weights * plain(x, kernel) ** 2)
+
+        got = jax.grad(by_filtering, (0, 1))(x, kernel)
+        expected = jax.grad(by_convolution, (0, 1))(x, kernel)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10), got, expected)
+
+
+def test_kernels_of_a_row_of_blocks_are_transformed_one_by_one():
+    kernels = drawn((3, 3, 3, 2, 4)).astype(jnp.float32)
+    each = [winograd.transformed(kernel) for kernel in kernels]
+    np.testing.assert_allclose(winograd.transformed(kernels), np.stack(each), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("c_in", "c_out", "size", "stride", "pixels", "changes"),
+    [
+        (64, 96, 3, 1, 256, True),
+        (64, 64, 3, 2, 256, False),
+        (64, 64, 1, 1, 256, False),
+        (24, 64, 3, 1, 256, False),
+        (512, 64, 3, 1, 256, False),
+        (64, 96, 3, 1, 64, False),
+    ],
+)
+def test_wide_convolutions_of_large_maps_are_prepared(c_in, c_out, size, stride, pixels, changes):
+    conv = Conv(c_in, c_out, size, stride, bias=True, rngs=nnx.Rngs(0))
+    x = drawn((1, 10, 6, c_in)).astype(jnp.float32)
+    before, shape = conv(x), conv.kernel[...].shape
+    conv.prepare_for_cpu(pixels)
+    assert (conv.kernel[...].shape != shape) == changes
+    np.testing.assert_allclose(conv(x), before, atol=2e-5)
