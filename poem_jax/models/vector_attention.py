@@ -12,6 +12,7 @@ The neighbours are visited in a loop, each visit recomputed in the backward pass
 array is kept.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -22,6 +23,11 @@ from flax import nnx
 from poem_jax.geometry.neighbours import nearest
 from poem_jax.models.layers import linear
 from poem_jax.typing import Array, Float, Int
+
+_TOGETHER = 8
+"""Neighbours times samples that are visited at once: enough to share a product between cores."""
+_UNROLLED = 4
+"""Visits that are written out where that spares a copy."""
 
 
 class Deltas(NamedTuple):
@@ -89,7 +95,7 @@ class VectorAttention(nnx.Module):
             inside = per_query - _rows(beta, neighbour.index) + added
             return jax.nn.relu(inside) @ to_logits, _rows(psi, neighbour.index) + value
 
-        return _softmax_sum(visit, neighbours) + offset
+        return _softmax_sum(visit, neighbours, per_query) + offset
 
     def with_deltas(self, queries: Float[Array, "batch query 3"], neighbours: Neighbours) -> Neighbours:
         """Compute beforehand what depends on nothing but the positions."""
@@ -149,35 +155,31 @@ def _rows(
     return jax.vmap(lambda rows, i: rows.at[i].get(mode="promise_in_bounds"))(table, index)
 
 
-def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]:
-    """Return sum_j softmax_j(logits) * values over the visits.
+def _softmax_sum(visit, neighbours: Neighbours, like: Array) -> Float[Array, "batch query c"]:
+    """Return sum_j softmax_j(logits) * values over the visits, of the shape and type of `like`.
 
     The sums are kept relative to the largest logit so far (Milakov and Gimelshein 2018, online softmax),
     which has no derivative: the quotient does not depend on it.
     """
 
     @jax.checkpoint  # pyright: ignore[reportPrivateImportUsage]
-    def add(sums: _Sums, neighbour: Neighbours) -> _Sums:
-        logits, values = visit(neighbour)
-        rise = jax.lax.stop_gradient(logits) - sums.largest
-        # Either the old sums or the new weight is scaled by one, so one exponential serves both.
-        smaller = jnp.exp(-jnp.abs(rise))
-        kept, weight = jnp.where(rise > 0, smaller, 1), jnp.where(rise > 0, 1, smaller)
-        weight = _with_derivative(weight, logits)
+    def add(sums: _Sums, some: Neighbours) -> _Sums:
+        logits, values = jax.vmap(visit)(some)
+        largest = jnp.maximum(sums.largest, jax.lax.stop_gradient(jnp.max(logits, 0)))
+        kept, weights = jnp.exp(sums.largest - largest), jnp.exp(logits - largest)
         return _Sums(
-            jnp.maximum(sums.largest, jax.lax.stop_gradient(logits)),
-            kept * sums.denominator + weight,
-            kept * sums.numerator + weight * values,
+            largest,
+            kept * sums.denominator + jnp.sum(weights, 0),
+            kept * sums.numerator + jnp.sum(weights * values, 0),
         )
 
-    logits, values = visit(jax.tree.map(lambda leaf: leaf[0], neighbours))
-    weight = _with_derivative(jnp.ones_like(logits), logits)
-    first = _Sums(jax.lax.stop_gradient(logits), weight, weight * values)
-    rest = jax.tree.map(lambda leaf: leaf[1:], neighbours)
-    sums, _ = jax.lax.scan(lambda sums, neighbour: (add(sums, neighbour), None), first, rest)
+    # Below all logits, so that the first visit counts whole and what was before it not at all.
+    nothing = _Sums(
+        jnp.full_like(like, jnp.finfo(like.dtype).min), jnp.zeros_like(like), jnp.zeros_like(like)
+    )
+    together = math.gcd(len(neighbours.index), max(1, _TOGETHER // len(like)))
+    some = jax.tree.map(lambda leaf: leaf.reshape(-1, together, *leaf.shape[1:]), neighbours)
+    # A loop would copy the deltas, which are arguments of the program, before it starts.
+    unroll = neighbours.deltas is not None and len(some.index) <= _UNROLLED
+    sums, _ = jax.lax.scan(lambda sums, some: (add(sums, some), None), nothing, some, unroll=unroll)
     return sums.numerator / sums.denominator
-
-
-def _with_derivative(weight: Array, logits: Array) -> Array:
-    """Return `weight`, a constant number, as the exponential of `logits` that it is."""
-    return weight * (1 + (logits - jax.lax.stop_gradient(logits)))
