@@ -65,6 +65,8 @@ _IGNORED_ENDINGS = ("embeddings.position_ids",)
 """Written by older versions of the library that the decoder came from."""
 _CLASSIFIER = ("incre_modules.", "downsamp_modules.", "final_layer.", "classifier.", "fc.")
 """Heads of ImageNet checkpoints."""
+_RESNET_STAGES = 4
+"""Of every ResNet in torchvision."""
 
 _log = logging.getLogger(__name__)
 
@@ -193,7 +195,7 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, para
 
     Args:
         state_dict: HRNet's own names, or torchvision's for a ResNet; names may start with `module.`. The
-            classifier is ignored.
+            classifier is ignored, and so are the stages behind the last one of a ResNet that is cut short.
         config: the model; its trunk must be the one that the weights are of.
         params: its parameters.
 
@@ -204,11 +206,11 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, para
     state = _without_prefix(state_dict)
     rows = list(trunk_rows(trunk))
     leaves, problems = read_rows(rows, state, expected_leaves(config))
-    known = {row.source for row in rows}
+    known, ignored = {row.source for row in rows}, _CLASSIFIER + _stages_behind(trunk)
     problems += [
         f"{name}: unknown, got shape {array.shape}"
         for name, array in state.items()
-        if name not in known and not name.startswith(_CLASSIFIER) and not name.endswith("num_batches_tracked")
+        if name not in known and not name.startswith(ignored) and not name.endswith("num_batches_tracked")
     ]
     if problems:
         raise ValueError(
@@ -217,6 +219,13 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, para
         )
     _check_finite(leaves)
     return unflatten({**flatten(params), **leaves}, params)
+
+
+def _stages_behind(trunk: HRNetConfig | ResNetConfig) -> tuple[str, ...]:
+    """Return how the names begin of torchvision's stages that a ResNet leaves out at its end."""
+    if isinstance(trunk, HRNetConfig):
+        return ()
+    return tuple(f"layer{stage + 1}." for stage in range(len(trunk.blocks), _RESNET_STAGES))
 
 
 def check_anchors(config: Config, params: Params, hand: HandModel) -> None:
