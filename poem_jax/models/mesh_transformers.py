@@ -24,7 +24,8 @@ Where the paper says nothing, the release is followed: 6 layers of 8 heads, 2048
 - the grid has D = 32 depths of linearly increasing steps, as POEM v1's, on rays through the cells' centres;
 - FTL's tokens have the release's code of view, row and column in their keys: DETR's decoder has to know where
   a token stands, and canonical features do not say it;
-- FTL's fusing convolution is 1 x 1, without a norm;
+- FTL's points come from the map by a 1 x 1 convolution, for 256 channels are no multiple of 3, and its
+  fusing convolution is 1 x 1; neither has a norm or a ReLU;
 - the query embeddings are the paper's `E_X` alone, without METRO's template: the section says so of both;
 - points are shares of the cuboid that the ablation of one stage names, starting from its middle.
 """
@@ -235,7 +236,8 @@ class EncodedPositions(nnx.Module):
 
 class CanonicalMaps(nnx.Module):
     """Canonical fusion of the paper: B_W = (T^-1 reshape(B_cam, (W, H, C / 3, 3))), flattened; all views,
-    concatenated, go through one convolution, which gives each a map again.
+    concatenated, go through one convolution, which gives each a map again. B_cam has 3 numbers a point, from
+    the map by a linear layer alone: a coordinate may have either sign, as where T^-1 takes it.
 
     Its weights belong to a first, second, ... view: up to `num_views` may be valid, and they may not change
     places. Views that are not valid are taken for none.
@@ -245,14 +247,14 @@ class CanonicalMaps(nnx.Module):
         assert isinstance(config.fusion, CanonicalFusion)
         self.num_views, self.width = config.fusion.num_views, config.width
         channels = 3 * config.fusion.num_points
-        self.to_points = ConvNorm(self.width, channels, 1, bias=True, rngs=rngs)
+        self.to_points = Conv(self.width, channels, 1, bias=True, rngs=rngs)
         self.fuse = Conv(self.num_views * channels, self.num_views * self.width, 1, bias=True, rngs=rngs)
         self.place_code = PlaceCode(self.width, rngs=rngs)
 
     def __call__(self, maps: Float[Array, "batch view h w c"], cams: Cameras, mode: NormMode) -> Tokens:
         """Return the tokens; `config.view_range` says how many views there may be."""
         batch, view, h, w, _ = maps.shape
-        points = _per_image(self.to_points, maps, mode).reshape(batch, view, -1, 3)
+        points = self.to_points(maps.reshape(-1, h, w, self.width)).reshape(batch, view, -1, 3)
         moved = transform_points(invert_rigid(cams.T_cam_from_world), points).reshape(batch, view, h, w, -1)
         canonical, cams = valid_views_first(moved, cams)
         canonical = jnp.where(cams.view_mask[..., None, None, None], canonical, 0)

@@ -341,18 +341,25 @@ def _conv_norm(layer, x: np.ndarray) -> np.ndarray:
     return np.maximum(y, 0) if layer.relu else y
 
 
+def _linear(kernel: np.ndarray, bias: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return x @ kernel + bias
+
+
 def test_canonical_fusion_of_the_paper(make_scene):
     """Every view's points by T^-1; all views through one convolution, whose other weights meet nothing."""
     cams, _, R, t = _cameras(make_scene)
     fusion = _fusion("ftl", CanonicalMaps)
     tokens = fusion(MAPS, cams, NormMode())
-    kernel, bias = np.asarray(fusion.fuse.kernel[...])[0, 0], np.asarray(fusion.fuse.bias[...])
+    to_points, fuse = (
+        (np.asarray(layer.kernel[...])[0, 0], np.asarray(layer.bias[...]))
+        for layer in (fusion.to_points, fusion.fuse)
+    )
     for row, column in ((0, 0), (2, 3)):
         joined = np.zeros((5, 3, 3))
         for view in range(3):
-            points = _conv_norm(fusion.to_points, MAPS[0, view, row, column]).reshape(3, 3)
+            points = _linear(*to_points, MAPS[0, view, row, column]).reshape(3, 3)
             joined[view] = (points - t[view]) @ R[view]
-        fused = (joined.ravel() @ kernel + bias).reshape(5, WIDTH)
+        fused = _linear(*fuse, joined.ravel()).reshape(5, WIDTH)
         for view in range(3):
             token = tokens.values[0, 16 * view + 4 * row + column]
             np.testing.assert_allclose(token, fused[view], atol=2e-5)
