@@ -27,6 +27,7 @@ from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.training.config import BatchShape, DataConfig, OptimizerConfig, RunConfig, Schedule, TrainConfig
 from poem_jax.training.recipes import RECIPES, experiment
+from poem_jax.training.source import validation_batches
 from poem_jax.training.state import create_state, learning_rate
 from poem_jax.training.step import train_step
 from poem_jax.weights import torch_import
@@ -128,10 +129,23 @@ def test_a_loss_of_what_the_model_does_not_give(loss, weight):
 def test_experiments_that_the_system_cannot_follow():
     with pytest.raises(ValueError, match="`first_stage_steps` must be 0 for a StandInConfig without"):
         experiment_of(first_stage_steps=10)
-    with pytest.raises(ValueError, match=r"StandInConfig is made for 4 to 4 views.*got \[2\]"):
+    with pytest.raises(ValueError, match=r"must be 4, as the layers of this StandInConfig.*got \[2\]"):
         experiment_of(model=StandInConfig(views=4))
-    with pytest.raises(ValueError, match=r"made for 2 to 2 views.*got \[2, 4, 8\]"):
+    with pytest.raises(ValueError, match=r"must not exceed 2, which the layers.*got \(2, 4, 8\)"):
         experiment_of(model=StandInConfig(views=2), train=RunConfig(validate_every=1))
+
+
+def test_a_model_for_two_views_is_evaluated_and_validated_with_one():
+    model = StandInConfig(views=2)
+    run = RunConfig(validate_every=1, validation_samples=1, validation_views=(1, 2))
+    config = experiment_of(model=model, train=run)
+    for views in (1, 2):
+        (batch,) = validation_batches(config, views)
+        np.testing.assert_array_equal(batch.cameras.view_mask.sum(-1), views)
+        assert batch.views.shape[1] == 2
+    predict = (model_predictor(params_of(model), config) for config in (model, CONFIG))
+    padded, free = (f(batch_of(1)).found.vertices_world for f in predict)
+    np.testing.assert_allclose(padded, free, atol=1e-6)
 
 
 def test_the_recipes_drop_the_rate_where_the_release_does():
@@ -224,7 +238,7 @@ def test_hands_of_a_capture_have_joint_9_for_a_root_and_no_pixels(views):
 def test_a_rig_with_another_number_of_cameras_is_one_line():
     rig, frame, _ = capture(3, 3)
     config = StandInConfig(views=4)
-    with pytest.raises(ValueError, match=r"the rig must have 4 views, .* got 3"):
+    with pytest.raises(ValueError, match=r"the rig must have 4 cameras, .* got 3. Take a"):
         list(predict_hands([frame], Take(rig, ("right",), [frame]), make_network(config, params_of(config))))
 
 

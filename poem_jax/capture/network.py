@@ -31,7 +31,6 @@ from poem_jax.hand.model import mirror_pose
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
-from poem_jax.models.network import check_view_count
 from poem_jax.typing import Array, Int, Params
 from poem_jax.weights import store
 
@@ -79,7 +78,7 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
 
     The batch is padded with masked hands, so that one program serves takes of any length.
     """
-    check_view_count(network.config, take.rig.num_views, "the rig")
+    check_rig(network.config, take.rig)
     num_hands = len(take.hand_sides)
     frames_together = max(1, MAX_BATCH // num_hands)
     for group in in_groups(frames, frames_together):
@@ -96,6 +95,17 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
                 for crop, known, side in zip(frame.crops, frame.hands, take.hand_sides, strict=True)
             )
             yield frame._replace(hands=tuple(results), crops=())
+
+
+def check_rig(config: ModelConfig, rig: Rig) -> None:
+    """Raise `ValueError` for a number of cameras that a model cannot take."""
+    least, most = config.view_range
+    if rig.num_views < least or (most is not None and rig.num_views > most):
+        raise ValueError(
+            f"the rig must have {config.views_in_words} cameras, as the layers of this "
+            f"{type(config).__name__} are made for; got {rig.num_views}. Take a model for {rig.num_views}, "
+            "or the shipped weights, which take any number"
+        )
 
 
 def views_needed(config: ModelConfig) -> int:
