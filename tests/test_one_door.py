@@ -26,6 +26,8 @@ from poem_jax.models.apply import init
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.training.config import BatchShape, DataConfig, OptimizerConfig, RunConfig, Schedule, TrainConfig
+from poem_jax.training.loop import train
+from poem_jax.training.parallel import check_batch_sizes, data_mesh
 from poem_jax.training.recipes import RECIPES, experiment
 from poem_jax.training.source import validation_batches
 from poem_jax.training.state import create_state, learning_rate
@@ -133,6 +135,16 @@ def test_experiments_that_the_system_cannot_follow():
         experiment_of(model=StandInConfig(views=4))
     with pytest.raises(ValueError, match=r"must not exceed 2, which the layers.*got \(2, 4, 8\)"):
         experiment_of(model=StandInConfig(views=2), train=RunConfig(validate_every=1))
+
+
+def test_samples_that_depend_on_each_other_stay_on_one_device(tmp_path):
+    run = RunConfig(out=str(tmp_path / "run"))
+    config = experiment_of(model=StandInConfig(coupled=True), train=run)
+    assert jax.device_count() == 2
+    with pytest.raises(ValueError, match=r"this StandInConfig must stay on one device, .* got 2 devices"):
+        train(config)
+    check_batch_sizes(config, data_mesh(jax.devices()[:1]))
+    check_batch_sizes(replace(config, model=CONFIG), data_mesh())
 
 
 def test_a_model_for_two_views_is_evaluated_and_validated_with_one():
