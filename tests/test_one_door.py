@@ -247,6 +247,19 @@ def test_hands_of_a_capture_have_joint_9_for_a_root_and_no_pixels(views):
         np.testing.assert_array_equal(np.isfinite(hand.joints_shown), crops.view_mask)
 
 
+def test_a_hand_that_depends_on_its_batch_is_alone_in_it():
+    config = StandInConfig(coupled=True)
+    params = params_of(config)
+    rig, frame, crops = capture(3, 3)
+    brighter = frame._replace(crops=(crops._replace(views=255 - crops.views // 8),))
+
+    def hand(frames):
+        found = list(predict_hands(frames, Take(rig, ("left",), frames), make_network(config, params)))
+        return found[0].hands[0].vertices_world
+
+    np.testing.assert_allclose(hand([frame, brighter]), hand([frame]), atol=1e-7)
+
+
 def test_a_rig_with_another_number_of_cameras_is_one_line():
     rig, frame, _ = capture(3, 3)
     config = StandInConfig(views=4)
