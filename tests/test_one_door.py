@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import shutil
 from dataclasses import replace
 
 import jax
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import MultiViewBatch
+from poem_jax.capture.demo import demo_folder
 from poem_jax.capture.frame import Frame, HandCrops, HandResult
 from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import make_network, predict_hands
 from poem_jax.capture.take import Take
+from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
 from poem_jax.evaluation.stages import check_has_stages
 from poem_jax.evaluation.tables import format_report
@@ -265,6 +268,17 @@ def test_a_rig_with_another_number_of_cameras_is_one_line():
     config = StandInConfig(views=4)
     with pytest.raises(ValueError, match=r"the rig must have 4 cameras, .* got 3. Take a"):
         list(predict_hands([frame], Take(rig, ("right",), [frame]), make_network(config, params_of(config))))
+
+
+def test_another_number_of_cameras_is_said_before_hands_are_looked_for(tmp_path):
+    config = StandInConfig(views=8)
+    save(tmp_path / "model", config, params_of(config))
+    take = tmp_path / "take"
+    shutil.copytree(demo_folder(), take, ignore=shutil.ignore_patterns("*.npz"))
+    command = Reconstruct(take, tmp_path / "out", checkpoint=tmp_path / "model")
+    with pytest.raises(ValueError, match=r"the rig must have 8 cameras, .* got 4"):
+        command.run()
+    assert not (tmp_path / "out").exists()
 
 
 # Released weights.

@@ -104,7 +104,7 @@ def load(path: str | os.PathLike, *, expected: ModelConfig | None = None) -> tup
             or another config than `expected`.
     """
     path = Path(path)
-    config = _read_config(path)
+    config = read_config(path)
     if expected is not None and expected != config:
         raise ValueError(
             f"checkpoint of another config at {path}: {_config_difference(expected, config)}. "
@@ -206,7 +206,14 @@ def _narrowed(name: str, leaf: np.ndarray, dtype: Any) -> np.ndarray:
     return leaf.astype(dtype)
 
 
-def _read_config(path: Path) -> ModelConfig:
+def read_config(path: str | os.PathLike) -> ModelConfig:
+    """Read the config of a model that `save` wrote, and none of its weights.
+
+    Raises:
+        FileNotFoundError: no such folder, or it misses its config or its arrays.
+        ValueError: not a config.
+    """
+    path = Path(path)
     file = path / CONFIG_FILE
     for needed in (path, file, path / ARRAYS_FOLDER):
         if not needed.exists():
