@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -245,10 +246,21 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 def _config_difference(expected: ModelConfig, got: ModelConfig) -> str:
     if type(expected) is not type(got):
         return f"expected a {type(expected).__name__}, got a {type(got).__name__}"
-    ours, theirs = json.loads(to_json(expected)), json.loads(to_json(got))
-    lines = [
-        f"`{key}` expected {ours.get(key)}, got {theirs.get(key)}"
-        for key in ours.keys() | theirs.keys()
-        if ours.get(key) != theirs.get(key)
-    ]
-    return "; ".join(sorted(lines))
+    return "; ".join(_differences(json.loads(to_json(expected)), json.loads(to_json(got)), ""))
+
+
+def _differences(expected: Any, got: Any, path: str) -> Iterator[str]:
+    """List by dotted name where two configs in their JSON form differ; of a part that is of another class,
+    only that it is."""
+    if expected == got:
+        return
+    are_objects = isinstance(expected, dict) and isinstance(got, dict)
+    if not are_objects or expected.get("kind") != got.get("kind"):
+        yield f"`{path}` expected {_named(expected)}, got {_named(got)}"
+        return
+    for key in expected:
+        yield from _differences(expected[key], got[key], f"{path}.{key}" if path else key)
+
+
+def _named(value: Any) -> Any:
+    return f"a {value['kind']}" if isinstance(value, dict) else value
