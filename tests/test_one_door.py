@@ -37,6 +37,7 @@ from poem_jax.training.state import create_state, learning_rate
 from poem_jax.training.step import train_step
 from poem_jax.weights import torch_import
 from poem_jax.weights.config_json import from_json, to_json
+from poem_jax.weights.release_files import import_release
 from poem_jax.weights.store import load, save
 from poem_jax.weights.torch_import import convert, export_state_dict
 from tests import stand_in
@@ -351,3 +352,34 @@ def test_a_variant_says_what_it_needs(monkeypatch):
     del state["head.move.0.bias"]
     with pytest.raises(ValueError, match="not of `num_views` = 5"):
         convert(state, "stand-in", mano=default_hand(), num_views=5)
+
+
+def test_a_number_of_views_that_the_data_set_has_not_is_doubted(monkeypatch, caplog):
+    state = checkpoint()
+    monkeypatch.setitem(
+        presets.RELEASED, "stand-in", lambda dataset, num_views: StandInConfig(views=num_views)
+    )
+    for dataset, views in presets.RELEASED_VIEWS.items():
+        for given in (None, views):
+            config, _ = convert(state, "stand-in", mano=default_hand(), dataset=dataset, num_views=given)
+            assert config == StandInConfig(views=views)
+    assert caplog.messages == []
+    convert(state, "stand-in", mano=default_hand(), dataset="ho3d", num_views=8)
+    assert "the released stand-in of ho3d is made for 5 views, not for 8: is `dataset` right?" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("variant", "option", "message"),
+    [
+        (
+            "v2-small",
+            {"dataset": "ho3d"},
+            "released for all data sets at once; leave out --dataset",
+        ),
+        ("v2-small", {"num_views": 8}, "v2-small takes any number of views; leave out --num-views"),
+        ("pe-meshtr", {"num_views": 4}, "pe-meshtr takes any number of views; leave out --num-views"),
+    ],
+)
+def test_what_is_of_no_account_is_refused(tmp_path, variant, option, message):
+    with pytest.raises(ValueError, match=message):
+        import_release(tmp_path / "none", variant, mano=tmp_path / "none", out=tmp_path / "out", **option)

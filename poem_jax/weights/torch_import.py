@@ -27,7 +27,7 @@ from poem_jax.models.mesh_transformer_config import MeshTransformerConfig
 from poem_jax.models.mvp_config import MvpConfig
 from poem_jax.models.network import constants_of, describe, with_static_indices
 from poem_jax.models.poem_v1_config import PoemV1Config
-from poem_jax.models.presets import DATASETS, RELEASED, released
+from poem_jax.models.presets import DATASETS, RELEASED, RELEASED_VIEWS, released
 from poem_jax.typing import Float, Int, Params
 from poem_jax.weights.name_table import NameRow, read_rows, write_rows
 from poem_jax.weights.release_keys import HEAD, is_parametric
@@ -104,7 +104,7 @@ def convert(
     anchor_points: Float[np.ndarray, "*one anchor 3"] | None = None,
     anchor_indices: Int[np.ndarray, "*one anchor"] | None = None,
     dataset: str = "dexycb",
-    num_views: int = 8,
+    num_views: int | None = None,
 ) -> tuple[ModelConfig, Params]:
     """Turn a released state dict into a model that `apply` runs.
 
@@ -121,7 +121,8 @@ def convert(
         anchor_indices: likewise `anchor_idx.npy`.
         dataset: POEM v1 and the baselines: what the model was trained on, one of `presets.DATASETS`. It fixes
             the space in which hands are sought, which the arrays do not tell.
-        num_views: MvP alone: views that its layers are made for (8 in DexYCB, 5 in HO3D, 4 in OakInk).
+        num_views: MvP alone: views that its layers are made for, None = as released (8 in DexYCB, 5 in HO3D,
+            4 in OakInk); of another number a warning is logged.
 
     Returns: the config and the parameters, float32.
 
@@ -137,6 +138,15 @@ def convert(
         "anchor_indices": anchor_indices,
     }
     _check_assets(assets, variant, needed=isinstance(config, Config))
+    if config != released(variant, dataset=dataset):
+        _log.warning(
+            "the released %s of %s is made for %d views, not for %s: is `dataset` right? The space in which "
+            "hands are sought is that of the data set",
+            variant,
+            dataset,
+            RELEASED_VIEWS[dataset],
+            num_views,
+        )
     hand, names = _right_hand(mano), names_of(config)
     state = _without_prefix(state_dict)
     leaves, problems = read_rows(names.rows, state, expected_leaves(config))
@@ -292,17 +302,20 @@ def _differing_aliases(state: dict[str, np.ndarray], names: Names) -> list[str]:
 
 
 def _report(problems: list[str], state: dict[str, np.ndarray], variant: str, most_views: int | None) -> str:
-    looks_like = _guess(state)
+    looks_like, views = _guess(state)
     hint = "Is the file cut short, or of another model?"
     if most_views is not None:
         hint = f"Is the file cut short, of another model, or not of `num_views` = {most_views}?"
     if looks_like not in (None, variant):
         hint = f"The state dict looks like {looks_like}: pass that variant."
+    if views not in (None, most_views):
+        hint = f"{hint} It looks made for {views} views: pass that as `num_views`."
     return f"the state dict does not fit {variant}: {_shown(problems)}. {hint}"
 
 
-def _guess(state: dict[str, np.ndarray]) -> str | None:
-    """Tell the variant by the width of the query embeddings and by the parametric head."""
+def _guess(state: dict[str, np.ndarray]) -> tuple[str | None, int | None]:
+    """Tell the variant by the width of the query embeddings and by the parametric head, and the number of
+    views of one that is made for a number."""
     table = state.get(f"{HEAD}query_feat_embedding.weight")
     if table is None or table.ndim != 2:
         return _guess_by_names(state)
@@ -313,21 +326,23 @@ def _guess(state: dict[str, np.ndarray]) -> str | None:
             table.shape[1],
             parametric,
         ):
-            return variant
-    return None
+            return variant, None
+    return None, None
 
 
-def _guess_by_names(state: dict[str, np.ndarray]) -> str | None:
+def _guess_by_names(state: dict[str, np.ndarray]) -> tuple[str | None, int | None]:
     """Return the variant, not of POEM v2, that has exactly these names and shapes, if one has."""
     for variant in RELEASED:
-        config = released(variant)
-        if isinstance(config, Config):
-            continue
-        names = names_of(config)
-        _, problems = read_rows(names.rows, state, expected_leaves(config))
-        if not problems and not _unknown_or_unlike(state, names):
-            return variant
-    return None
+        for config in {released(variant, num_views=views): None for views in RELEASED_VIEWS.values()}:
+            if isinstance(config, Config):
+                continue
+            names = names_of(config)
+            if any(row.source not in state for row in names.rows):
+                continue
+            _, problems = read_rows(names.rows, state, expected_leaves(config))
+            if not problems and not _unknown_or_unlike(state, names):
+                return variant, config.view_range[1]
+    return None, None
 
 
 def _shown(problems: list[str]) -> str:
