@@ -26,7 +26,11 @@ Where the paper says nothing, the release is followed: 6 layers of 8 heads, 2048
   a token stands, and canonical features do not say it;
 - FTL's points come from the map by a 1 x 1 convolution, for 256 channels are no multiple of 3, and its
   fusing convolution is 1 x 1; neither has a norm or a ReLU;
-- the query embeddings are the paper's `E_X` alone, without METRO's template: the section says so of both;
+- the sines of a grid point begin with waves of twice the cuboid, and double in frequency;
+- `E_X` is what DETR calls query embeddings: added to queries and keys of every layer, the first of which
+  begins with zeros, where the paper's section on query points has it as the first layer's input;
+- the queries are `E_X` alone: of METRO the paper says that its tokens hold image features and the template's
+  coordinates, and "we adopt similar design", but then that the query tokens are `E_X`;
 - points are shares of the cuboid that the ablation of one stage names, starting from its middle.
 """
 
@@ -204,12 +208,12 @@ class EmbeddedPositions(nnx.Module):
 def grid_point_code(shares: Float[Array, "*batch 3"], width: int) -> Float[Array, "*batch c"]:
     """Encode points, given as shares of their space, by `width` / 2 sines, each followed by its cosine.
 
-    Of waves 2 pi x, 2 pi y, 2 pi z, then of twice the frequencies, and so on, until the channels are full:
-    the paper says no more than "a series of sinusoids". Frequencies rise, since points of one hand lie within
-    a tenth of the space.
+    Of waves pi x, pi y, pi z, then of twice the frequencies, and so on, until the channels are full: the
+    paper says no more than "a series of sinusoids". The longest wave is twice the space, so that its opposite
+    faces differ; frequencies rise, since points of one hand lie within a tenth of it.
     """
     wave = np.arange(width // 2)
-    angle = shares[..., wave % 3] * jnp.asarray(2 * np.pi * 2.0 ** (wave // 3), shares.dtype)
+    angle = shares[..., wave % 3] * jnp.asarray(np.pi * 2.0 ** (wave // 3), shares.dtype)
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], -1).reshape(*shares.shape[:-1], width)
 
 

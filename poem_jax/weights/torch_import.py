@@ -309,7 +309,7 @@ def _report(problems: list[str], state: dict[str, np.ndarray], variant: str, mos
     if looks_like not in (None, variant):
         hint = f"The state dict looks like {looks_like}: pass that variant."
     if views not in (None, most_views):
-        hint = f"{hint} It looks made for {views} views: pass that as `num_views`."
+        hint = f"{hint} It looks made for {views} views: pass its data set, or that as `num_views`."
     return f"the state dict does not fit {variant}: {_shown(problems)}. {hint}"
 
 

@@ -33,6 +33,7 @@ from poem_jax.models.mesh_transformers import (
     EmbeddedPositions,
     MeshTransformer,
     PixelUnitMaps,
+    grid_point_code,
 )
 from poem_jax.models.world_frame import enter_working_frame
 
@@ -324,11 +325,16 @@ def test_position_embedded_fusion_of_the_paper(make_scene):
             for d, depth in enumerate((0.2, 0.2 + 1.8 * 2 / 6)):
                 ray = np.linalg.inv(K[view]) @ np.array([8 * column + 4, 8 * row + 4, 1.0])
                 share = (R[view].T @ (depth * ray - t[view]) - low) / (high - low)
-                angles = 2 * np.pi * np.array([*share, 2 * share[0]])
+                angles = np.pi * np.array([*share, 2 * share[0]])
                 waves = np.stack([np.sin(angles), np.cos(angles)], -1).ravel()
                 expected[8 * d : 8 * d + 8] += waves
             token = tokens.values[0, 16 * view + 4 * row + column]
             np.testing.assert_allclose(token, expected, atol=2e-5)
+
+
+def test_opposite_faces_of_the_cuboid_have_other_codes():
+    faces = grid_point_code(jnp.asarray([[0.0, 0.5, 0.5], [1.0, 0.5, 0.5]]), 8)
+    assert np.abs(faces[0] - faces[1]).max() > 1
 
 
 def _conv_norm(layer, x: np.ndarray) -> np.ndarray:
