@@ -117,7 +117,7 @@ class MeshTransformer(nnx.Module):
         self.fusion = _FUSIONS[type(config.fusion), config.design](config, rngs=rngs)
         self.queries = (EmbeddedQueries if by_paper else ReferenceQueries)(config, rngs=rngs)
         self.decoder = DetrDecoder(config.decoder, config.width, rngs=rngs)
-        self.offsets = OffsetNetwork(config.width, rngs=rngs)
+        self.offsets = ReadOutNetwork(config.width, rngs=rngs)
         self.hand = HandConstants(hand)
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewMaps:
@@ -403,7 +403,7 @@ class ReferenceQueries(nnx.Module):
         return Queries(self.out(jax.nn.relu(self.hidden(code))), jax.nn.sigmoid(points))
 
 
-class OffsetNetwork(nnx.Module):
+class ReadOutNetwork(nnx.Module):
     """Three layers from embedding to the logits' offset, the same after every decoder layer."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:

@@ -35,7 +35,7 @@ from poem_jax.models.config import (
     Stem,
     ViewWeights,
 )
-from poem_jax.models.frustum_config import DEXYCB_CUBOID, HO3D_CUBOID, OAKINK_CUBOID
+from poem_jax.models.frustum_config import CUBOIDS
 from poem_jax.models.mesh_transformer_config import (
     FTL_MESHTR,
     PE_MESHTR,
@@ -112,8 +112,6 @@ V2_NANO = Config(
     basis=BasisConfig(num_points=2048),
 )
 
-CUBOIDS = {"dexycb": DEXYCB_CUBOID, "ho3d": HO3D_CUBOID, "oakink": OAKINK_CUBOID}
-"""Where hands are in the data sets that models of POEM v1 and its baselines were released for."""
 DATASETS = tuple(CUBOIDS)
 RELEASED_VIEWS = {"dexycb": 8, "ho3d": 5, "oakink": 4}
 """Cameras of these data sets, which the layers of a released MvP are made for."""
