@@ -3,9 +3,9 @@
 `torch_import.py` converts the arrays; here their files are found, checked and written.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -77,21 +77,19 @@ def import_release(
         FileNotFoundError: a file is missing.
         ValueError: files that are damaged, hostile or do not belong together, or `out` exists.
     """
-    which = {} if dataset is None else {"dataset": dataset}
-    which |= {} if num_views is None else {"num_views": num_views}
-    out, config = Path(out), released(variant, **which)
-    _check_options(variant, config, which)
+    name = dataset or "dexycb"
+    out, config = Path(out), released(variant, dataset=name, num_views=num_views)
+    _check_options(variant, config, dataset, num_views)
     _check_folder(out, overwrite)
     hand, constants = mano_file.load(mano), _assets(assets, config, variant)
     state = load_state_dict(checkpoint)
-    _, params = convert(state, variant, mano=hand, **constants, **which)
+    _, params = convert(state, variant, mano=hand, **constants, dataset=name, num_views=num_views)
     if isinstance(config, Config) and not accept_anchors:
         check_anchors(config, params, hand)
     store.save(out, config, params, overwrite=overwrite)
     num_read = _num_read(state, config)
     num_parameters = sum(leaf.size for leaf in jax.tree.leaves(params["trainable"]))
-    model = _described(variant, config, dataset or "dexycb")
-    return Imported(model, num_read, len(state) - num_read, num_parameters)
+    return Imported(_described(variant, config, name), num_read, len(state) - num_read, num_parameters)
 
 
 def export_release(model: str | Path, out: str | Path, *, overwrite: bool = False) -> int:
@@ -120,11 +118,11 @@ def export_release(model: str | Path, out: str | Path, *, overwrite: bool = Fals
     return len(state)
 
 
-def _check_options(variant: str, config: ModelConfig, which: Mapping[str, Any]) -> None:
+def _check_options(variant: str, config: ModelConfig, dataset: str | None, num_views: int | None) -> None:
     """Refuse what was said for nothing: it was meant for another variant."""
-    if isinstance(config, Config) and "dataset" in which:
+    if isinstance(config, Config) and dataset is not None:
         raise ValueError(f"{variant} was released for all data sets at once; leave out --dataset")
-    if "num_views" in which and not _takes_one_view_count(config):
+    if num_views is not None and not _takes_one_view_count(config):
         raise ValueError(f"{variant} takes any number of views; leave out --num-views")
 
 
