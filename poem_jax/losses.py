@@ -103,8 +103,9 @@ SYNTHETIC = LossRecipe(
 )
 """For short runs: absolute errors, points in units of 10 cm; the 2D term does not fade as it shrinks."""
 
-V1 = LossRecipe("v1", layers=Layers.EVERY, triangulation=10.0)
-"""POEM v1 as released: heat-map coordinates and triangulated joints, and every layer, summed."""
+V1 = LossRecipe("v1", layers=Layers.EVERY, triangulation=10.0, pose=0.0, shape=0.0)
+"""POEM v1 as released: heat-map coordinates and triangulated joints, and every layer, summed. As in all
+recipes made from it below, pose and shape are not supervised, though MvP's mesh is made of them."""
 
 V1_ONE_STAGE = replace(V1, name="v1-1stage", keypoints=0.0, triangulation=0.0)
 """Its ablation without a first stage."""

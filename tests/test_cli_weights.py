@@ -13,6 +13,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import NamedTuple, get_args, get_type_hints
 
+import jax
 import numpy as np
 import pytest
 
@@ -26,7 +27,12 @@ from poem_jax.hand.model import HandModel, mirror, template_queries
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.io.torch_file import load_state_dict, save_state_dict
+from poem_jax.models import presets
+from poem_jax.models.apply import init
 from poem_jax.models.config import Config, HRNetConfig
+from poem_jax.models.detr_config import DetrConfig
+from poem_jax.models.frustum_config import CUBOIDS
+from poem_jax.models.mesh_transformer_config import pe_meshtr_release
 from poem_jax.models.presets import PRESETS
 from poem_jax.training.config import flatten_config
 from poem_jax.typing import Params
@@ -213,6 +219,34 @@ def test_the_parametric_model_is_imported(tmp_path, small_presets):
     release = write_release(tmp_path, config)
     assert main(release.command(tmp_path / "out", "v2-medium-mano")) == 0
     assert_same_bits(poem_jax.load(tmp_path / "out")[1], release.converted(config, "v2-medium-mano"))
+
+
+def test_a_baseline_is_imported_with_its_data_set(tmp_path, capsys, monkeypatch):
+    whole = pe_meshtr_release("ho3d")
+    trunk = replace(whole.backbone, blocks=(1, 1), channels=(8, 16), stem_channels=8)
+    config = replace(whole, width=16, backbone=trunk, decoder=DetrConfig(1, 2, 16))
+    monkeypatch.setitem(
+        presets.RELEASED,
+        "pe-meshtr",
+        lambda dataset, num_views: replace(config, cuboid=CUBOIDS[dataset]),
+    )
+    params = init(config, key=jax.random.key(0))
+    # What no output depends on is constant; so it takes no space in the file.
+    state = {
+        f"module.{name}": np.broadcast_to(array.flat[0], array.shape) if not array.any() else array
+        for name, array in export_state_dict(config, params).items()
+    }
+    write_wrapped("zip", tmp_path / "model.pth.tar", state)
+    write_hand(tmp_path / "MANO_RIGHT.npz", default_hand())
+    files = [str(tmp_path / "model.pth.tar"), "--mano", str(tmp_path / "MANO_RIGHT.npz")]
+    out = tmp_path / "out"
+    command = ["import-torch", *files, "--variant", "pe-meshtr", "--dataset", "ho3d", "--out", str(out)]
+    assert main(command) == 0
+    loaded, found = poem_jax.load(out)
+    assert loaded == config
+    assert loaded.cuboid == CUBOIDS["ho3d"]
+    assert_same_bits(found["trainable"], params["trainable"])
+    assert "pe-meshtr of ho3d: " in capsys.readouterr().out
 
 
 @pytest.mark.slow

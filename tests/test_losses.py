@@ -183,6 +183,17 @@ def test_recipes_hold_the_release_weights():
     assert (RELEASE.layers, PAPER.layers) == (Layers.LAST, Layers.EVERY)
 
 
+@pytest.mark.parametrize("name", ["v1", "v1-1stage", "meshtr", "mvp"])
+def test_the_first_paper_s_systems_learn_no_pose_and_shape(hand, name):
+    prediction, batch = random_case(joints=21)
+    changed = prediction._replace(pose=1 + prediction.pose, shape=1 + prediction.shape)
+    before, after = (
+        multi_view_losses(guess, batch, hand=hand, image_hw=HW, recipe=RECIPES[name])[0]
+        for guess in (prediction, changed)
+    )
+    assert before == after
+
+
 def test_absolute_penalty_counts_in_the_unit_of_the_recipe(hand):
     prediction, batch = random_case()
     batch = batch._replace(

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import shutil
 from dataclasses import replace
 
 import jax
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import MultiViewBatch
+from poem_jax.capture.demo import demo_folder
 from poem_jax.capture.frame import Frame, HandCrops, HandResult
 from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import make_network, predict_hands
 from poem_jax.capture.take import Take
+from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
 from poem_jax.evaluation.stages import check_has_stages
 from poem_jax.evaluation.tables import format_report
@@ -26,11 +29,15 @@ from poem_jax.models.apply import init
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.training.config import BatchShape, DataConfig, OptimizerConfig, RunConfig, Schedule, TrainConfig
+from poem_jax.training.loop import train
+from poem_jax.training.parallel import check_batch_sizes, data_mesh
 from poem_jax.training.recipes import RECIPES, experiment
+from poem_jax.training.source import validation_batches
 from poem_jax.training.state import create_state, learning_rate
 from poem_jax.training.step import train_step
 from poem_jax.weights import torch_import
 from poem_jax.weights.config_json import from_json, to_json
+from poem_jax.weights.release_files import import_release
 from poem_jax.weights.store import load, save
 from poem_jax.weights.torch_import import convert, export_state_dict
 from tests import stand_in
@@ -128,22 +135,50 @@ def test_a_loss_of_what_the_model_does_not_give(loss, weight):
 def test_experiments_that_the_system_cannot_follow():
     with pytest.raises(ValueError, match="`first_stage_steps` must be 0 for a StandInConfig without"):
         experiment_of(first_stage_steps=10)
-    with pytest.raises(ValueError, match=r"StandInConfig is made for 4 to 4 views.*got \[2\]"):
+    with pytest.raises(ValueError, match=r"must be 4, as the layers of this StandInConfig.*got \[2\]"):
         experiment_of(model=StandInConfig(views=4))
-    with pytest.raises(ValueError, match=r"made for 2 to 2 views.*got \[2, 4, 8\]"):
+    with pytest.raises(ValueError, match=r"must not exceed 2, which the layers.*got \(2, 4, 8\)"):
         experiment_of(model=StandInConfig(views=2), train=RunConfig(validate_every=1))
 
 
+def test_samples_that_depend_on_each_other_stay_on_one_device(tmp_path):
+    run = RunConfig(out=str(tmp_path / "run"))
+    config = experiment_of(model=StandInConfig(coupled=True), train=run)
+    assert jax.device_count() == 2
+    with pytest.raises(ValueError, match=r"this StandInConfig must stay on one device, .* got 2 devices"):
+        train(config)
+    check_batch_sizes(config, data_mesh(jax.devices()[:1]))
+    check_batch_sizes(replace(config, model=CONFIG), data_mesh())
+
+
+def test_a_model_for_two_views_is_evaluated_and_validated_with_one():
+    model = StandInConfig(views=2)
+    run = RunConfig(validate_every=1, validation_samples=1, validation_views=(1, 2))
+    config = experiment_of(model=model, train=run)
+    for views in (1, 2):
+        (batch,) = validation_batches(config, views)
+        np.testing.assert_array_equal(batch.cameras.view_mask.sum(-1), views)
+        assert batch.views.shape[1] == 2
+    predict = (model_predictor(params_of(model), config) for config in (model, CONFIG))
+    padded, free = (f(batch_of(1)).found.vertices_world for f in predict)
+    np.testing.assert_allclose(padded, free, atol=1e-6)
+
+
 def test_the_recipes_drop_the_rate_where_the_release_does():
-    """Epoch 70 of 101, and 32 of 101 for FTL-MeshTR; the paper at 70 %."""
-    steps = 101 * 50
+    """Epoch 70 of 101, 32 of 101 for FTL-MeshTR and 70 of 100 for PE-MeshTR; the paper at 70 %."""
     data = experiment_of().data
-    dropped = {"v1-release": 70, "pe-meshtr-release": 70, "ftl-meshtr-release": 32, "mvp-release": 70}
-    for name, epochs in dropped.items():
-        config = experiment(name, name=name, model=CONFIG, data=data, train=RunConfig(steps=steps))
+    dropped = {
+        "v1-release": (70, 101),
+        "pe-meshtr-release": (70, 100),
+        "ftl-meshtr-release": (32, 101),
+        "mvp-release": (70, 101),
+    }
+    for name, (epoch, epochs) in dropped.items():
+        run = RunConfig(steps=50 * epochs)
+        config = experiment(name, name=name, model=CONFIG, data=data, train=run)
         rate = learning_rate(config)
-        assert rate(50 * epochs - 1) == pytest.approx(1e-4)
-        assert rate(50 * epochs + 1) == pytest.approx(1e-5)
+        assert rate(50 * epoch - 1) == pytest.approx(1e-4)
+        assert rate(50 * epoch + 1) == pytest.approx(1e-5)
         assert config.optimizer.clip.value == "per_tensor"
         assert config.optimizer.clip_norm == 1.0
     paper = experiment("v1", name="v1", model=CONFIG, data=data, train=RunConfig(steps=1000))
@@ -216,11 +251,35 @@ def test_hands_of_a_capture_have_joint_9_for_a_root_and_no_pixels(views):
         np.testing.assert_array_equal(np.isfinite(hand.joints_shown), crops.view_mask)
 
 
+def test_a_hand_that_depends_on_its_batch_is_alone_in_it():
+    config = StandInConfig(coupled=True)
+    params = params_of(config)
+    rig, frame, crops = capture(3, 3)
+    brighter = frame._replace(crops=(crops._replace(views=255 - crops.views // 8),))
+
+    def hand(frames):
+        found = list(predict_hands(frames, Take(rig, ("left",), frames), make_network(config, params)))
+        return found[0].hands[0].vertices_world
+
+    np.testing.assert_allclose(hand([frame, brighter]), hand([frame]), atol=1e-7)
+
+
 def test_a_rig_with_another_number_of_cameras_is_one_line():
     rig, frame, _ = capture(3, 3)
     config = StandInConfig(views=4)
-    with pytest.raises(ValueError, match=r"the rig must have 4 views, .* got 3"):
+    with pytest.raises(ValueError, match=r"the rig must have 4 cameras, .* got 3. Take a"):
         list(predict_hands([frame], Take(rig, ("right",), [frame]), make_network(config, params_of(config))))
+
+
+def test_another_number_of_cameras_is_said_before_hands_are_looked_for(tmp_path):
+    config = StandInConfig(views=8)
+    save(tmp_path / "model", config, params_of(config))
+    take = tmp_path / "take"
+    shutil.copytree(demo_folder(), take, ignore=shutil.ignore_patterns("*.npz"))
+    command = Reconstruct(take, tmp_path / "out", checkpoint=tmp_path / "model")
+    with pytest.raises(ValueError, match=r"the rig must have 8 cameras, .* got 4"):
+        command.run()
+    assert not (tmp_path / "out").exists()
 
 
 # Released weights.
@@ -293,3 +352,34 @@ def test_a_variant_says_what_it_needs(monkeypatch):
     del state["head.move.0.bias"]
     with pytest.raises(ValueError, match="not of `num_views` = 5"):
         convert(state, "stand-in", mano=default_hand(), num_views=5)
+
+
+def test_a_number_of_views_that_the_data_set_has_not_is_doubted(monkeypatch, caplog):
+    state = checkpoint()
+    monkeypatch.setitem(
+        presets.RELEASED, "stand-in", lambda dataset, num_views: StandInConfig(views=num_views)
+    )
+    for dataset, views in presets.RELEASED_VIEWS.items():
+        for given in (None, views):
+            config, _ = convert(state, "stand-in", mano=default_hand(), dataset=dataset, num_views=given)
+            assert config == StandInConfig(views=views)
+    assert caplog.messages == []
+    convert(state, "stand-in", mano=default_hand(), dataset="ho3d", num_views=8)
+    assert "the released stand-in of ho3d is made for 5 views, not for 8: is `dataset` right?" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("variant", "option", "message"),
+    [
+        (
+            "v2-small",
+            {"dataset": "ho3d"},
+            "released for all data sets at once; leave out --dataset",
+        ),
+        ("v2-small", {"num_views": 8}, "v2-small takes any number of views; leave out --num-views"),
+        ("pe-meshtr", {"num_views": 4}, "pe-meshtr takes any number of views; leave out --num-views"),
+    ],
+)
+def test_what_is_of_no_account_is_refused(tmp_path, variant, option, message):
+    with pytest.raises(ValueError, match=message):
+        import_release(tmp_path / "none", variant, mano=tmp_path / "none", out=tmp_path / "out", **option)

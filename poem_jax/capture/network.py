@@ -7,6 +7,7 @@ here, around the prediction, and nowhere else.
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import jax
@@ -31,7 +32,6 @@ from poem_jax.hand.model import mirror_pose
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
-from poem_jax.models.network import check_view_count
 from poem_jax.typing import Array, Int, Params
 from poem_jax.weights import store
 
@@ -77,11 +77,13 @@ def make_network(config: ModelConfig, params: Params, origin: str = "given") -> 
 def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iterator[Frame]:
     """Reconstruct the hands of a stream from their crops, some frames at a time.
 
-    The batch is padded with masked hands, so that one program serves takes of any length.
+    The batch is padded with masked hands, so that one program serves takes of any length. Where the samples
+    of a batch depend on each other, every hand is a batch of its own: it is the same whatever is beside it.
     """
-    check_view_count(network.config, take.rig.num_views, "the rig")
+    check_rig(network.config, take.rig)
     num_hands = len(take.hand_sides)
     frames_together = max(1, MAX_BATCH // num_hands)
+    batch_size = 1 if network.config.couples_samples else frames_together * num_hands
     for group in in_groups(frames, frames_together):
         crops = [_if_enough(crop, network.config) for frame in group for crop in frame.crops]
         sides = take.hand_sides * len(group)
@@ -89,13 +91,27 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
             _mirrored(crop) if crop and side == "left" else crop
             for crop, side in zip(crops, sides, strict=True)
         ]
-        predicted = iter(_predict(network, fed, take.rig.num_views, frames_together * num_hands))
+        predicted = chain.from_iterable(
+            _predict(network, fed[i : i + batch_size], take.rig.num_views, batch_size)
+            for i in range(0, len(fed), batch_size)
+        )
         for frame in group:
             results = (
                 _result(crop, next(predicted), known, side, take.rig, views_needed(network.config))
                 for crop, known, side in zip(frame.crops, frame.hands, take.hand_sides, strict=True)
             )
             yield frame._replace(hands=tuple(results), crops=())
+
+
+def check_rig(config: ModelConfig, rig: Rig) -> None:
+    """Raise `ValueError` for a number of cameras that a model cannot take."""
+    least, most = config.view_range
+    if rig.num_views < least or (most is not None and rig.num_views > most):
+        raise ValueError(
+            f"the rig must have {config.views_in_words} cameras, as the layers of this "
+            f"{type(config).__name__} are made for; got {rig.num_views}. Take a model for {rig.num_views}, "
+            "or the shipped weights, which take any number"
+        )
 
 
 def views_needed(config: ModelConfig) -> int:

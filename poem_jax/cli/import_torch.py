@@ -42,10 +42,12 @@ class ImportTorch:
     assets: OptionalFolder = None
     """The folder assets of the authors' repository: bps.npy, anchor.npy, anchor_idx.npy; for POEM v2 alone,
     which needs it."""
-    dataset: Literal["dexycb", "ho3d", "oakink"] = "dexycb"
-    """What a model of POEM v1 or a baseline was trained on."""
-    num_views: int = 8
-    """Views that the layers of an MvP are made for."""
+    dataset: Annotated[
+        Literal["dexycb", "ho3d", "oakink"] | None, tyro.conf.arg(metavar="{dexycb,ho3d,oakink}")
+    ] = None
+    """What a model of POEM v1 or a baseline was trained on; without it dexycb."""
+    num_views: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Views that the layers of an MvP are made for; without it those of the data set: 8, 5, 4."""
     accept_anchors: Flag = False
     """Take anchors that do not lie on the template of the hand."""
     overwrite: Flag = False
@@ -72,7 +74,7 @@ class ImportTorch:
                 accept_anchors=self.accept_anchors,
                 overwrite=self.overwrite,
             )
-        print(f"{self.variant}: {found.num_parameters:,} parameters")
+        print(f"{found.model}: {found.num_parameters:,} parameters")
         print(f"{found.num_read} arrays read, {found.num_ignored} ignored, for no output depends on them")
         print(f"written to {self.out} in {time.perf_counter() - start:.1f} s; now try")
         print(f"poem reconstruct CAPTURE --out out/ --checkpoint {self.out}")

@@ -62,12 +62,22 @@ class Reconstruct:
             raise ValueError("--detector is for --engine fit; the network sees the images themselves")
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
+        if self.checkpoint is not None and self.folder.is_dir():
+            self._check_model_fits(self.checkpoint)
         hand = hand_from(self.mano)
         boxes = self.boxes or where_hands_are(self.folder, self.out, self.rig, self.max_hands, self.video)
         with tells_what_is_left(self.out):
             written = self._fit(boxes, hand) if self.engine == "fit" else self._reconstruct(boxes)
         print_files(written, self.out)
         print_summary(written.report)
+
+    def _check_model_fits(self, checkpoint: Path) -> None:
+        """Refuse a model for another number of cameras before a take is searched for hands."""
+        from poem_jax.capture.folder import find_rig
+        from poem_jax.capture.network import check_rig
+        from poem_jax.weights.store import read_config
+
+        check_rig(read_config(checkpoint), find_rig(self.folder, self.rig))
 
     def _reconstruct(self, boxes: Path) -> "Written":
         from poem_jax.capture.pipeline import reconstruct

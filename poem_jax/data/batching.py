@@ -52,23 +52,23 @@ def _stack(name: str, values: list[Array | None]) -> Array | None:
 
 
 def pad_views(sample: MultiViewBatch, num_views: int) -> MultiViewBatch:
-    """Pad one sample (no batch axis) with masked views, up to `num_views`.
+    """Pad one sample, or a batch of samples, with masked views, up to `num_views`.
 
     Raises:
         ValueError: the sample has no view, or more than `num_views`.
     """
-    views = sample.views.shape[0]
+    views = sample.views.shape[-4]
     if not 1 <= views <= num_views:
         raise ValueError(f"a sample must have 1 to {num_views} views; got {views}")
     padding = num_views - views
     K, T_cam_from_world, view_mask = sample.cameras
     return sample._replace(
-        views=_pad_with_zeros(sample.views, padding),
-        keypoints_px=_pad_with_zeros(sample.keypoints_px, padding),
+        views=_pad_with_zeros(sample.views, padding, -4),
+        keypoints_px=_pad_with_zeros(sample.keypoints_px, padding, -3),
         cameras=Cameras(
-            _pad_with_first(K, padding),
-            _pad_with_first(T_cam_from_world, padding),
-            _pad_with_zeros(view_mask, padding),
+            _pad_with_first(K, padding, -3),
+            _pad_with_first(T_cam_from_world, padding, -3),
+            _pad_with_zeros(view_mask, padding, -1),
         ),
     )
 
@@ -89,11 +89,13 @@ def pad_batch(batch: MultiViewBatch, size: int) -> MultiViewBatch:
     return MultiViewBatch(cameras=cameras, sample_mask=_pad_with_zeros(mask, padding), **fields)
 
 
-def _pad_with_zeros(array: Array, padding: int) -> Array:
-    return np.concatenate([array, np.zeros((padding, *array.shape[1:]), array.dtype)])
+def _pad_with_zeros(array: Array, padding: int, axis: int = 0) -> Array:
+    shape = list(array.shape)
+    shape[axis] = padding
+    return np.concatenate([array, np.zeros(shape, array.dtype)], axis)
 
 
-def _pad_with_first(array: Array | None, padding: int) -> Array | None:
+def _pad_with_first(array: Array | None, padding: int, axis: int = 0) -> Array | None:
     if array is None:
         return None
-    return np.concatenate([array, np.repeat(np.asarray(array)[:1], padding, axis=0)])
+    return np.concatenate([array, np.repeat(np.take(array, [0], axis), padding, axis)], axis)

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from poem_jax.batch import MultiViewBatch, Prediction
-from poem_jax.data.batching import collate, pad_batch
+from poem_jax.data.batching import collate, pad_batch, pad_views
 from poem_jax.evaluation.baselines import mean_pose, mean_pose_rotated, noisy_dlt_roots
 from poem_jax.evaluation.metrics import evaluate, point_distances
 from poem_jax.evaluation.protocols import MM_PER_METRE, find_protocol
@@ -104,7 +104,8 @@ _Leaves = TypeVar("_Leaves", _Rows, _Truth)
 def model_predictor(params: Params, config: ModelConfig) -> Predictor:
     """Return the predictor of a model; every shape of batch compiles once.
 
-    The predictor raises `ValueError` for numbers of views that the model cannot take.
+    A model that is made for a number of views gets masked ones beside those that there are. The predictor
+    raises `ValueError` for numbers of views that the model cannot take.
     """
     both, given = (jax.jit(partial(f, config=config)) for f in (_reconstruct, _reconstruct_given))
 
@@ -116,7 +117,8 @@ def model_predictor(params: Params, config: ModelConfig) -> Predictor:
                 "and it takes none; leave 1 out of the view counts"
             )
         reconstruct = given if num_views == 1 and config.takes_root else both
-        return reconstruct(params, batch.views, batch.cameras, root_true)
+        padded = pad_views(batch, max(num_views, config.view_range[0]))
+        return reconstruct(params, padded.views, padded.cameras, root_true)
 
     return predict
 

@@ -417,6 +417,14 @@ class ModelConfig:
         return 1, None
 
     @property
+    def views_in_words(self) -> str:
+        """`view_range` for a message: "8", "1 to 8", "2 or more"."""
+        least, most = self.view_range
+        if most is None:
+            return f"{least} or more"
+        return f"{least}" if least == most else f"{least} to {most}"
+
+    @property
     def couples_samples(self) -> bool:
         """Whether a sample's result depends on the other samples of its batch."""
         return False

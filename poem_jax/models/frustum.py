@@ -11,7 +11,7 @@ import numpy as np
 
 from poem_jax.geometry.cameras import Cameras, unproject
 from poem_jax.models.frustum_config import Cuboid, DepthSteps, FrustumConfig
-from poem_jax.models.point_features import axis_code, interleaved_code
+from poem_jax.models.point_features import interleaved_code, place_codes
 from poem_jax.typing import Array, Bool, Float
 
 _EPSILON = 1e-5
@@ -90,19 +90,8 @@ def inverse_sigmoid(shares: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def view_row_column_code(
     view_mask: Bool[Array, "batch view"], map_hw: tuple[int, int], width: int
 ) -> Float[Array, "batch view h w c"]:
-    """Encode number of the view, row and column, `width` sines and cosines each, in this order.
-
-    Numbers count from 1 and are divided by how many there are, which for the views is the sample's valid
-    ones: so the code depends on how many views there are, and masked views do not count. What stands at
-    masked views means nothing.
-    """
-    dtype = jnp.result_type(float)
-    number = jnp.cumsum(view_mask, -1).astype(dtype)
-    count = jnp.sum(view_mask, -1, keepdims=True).astype(dtype)
-    views = axis_code(number, count, width)
-    rows, columns = (
-        axis_code(jnp.arange(1, size + 1, dtype=dtype), jnp.asarray(size, dtype), width) for size in map_hw
-    )
+    """Return the codes of view, row and column (`place_codes`) side by side, `width` numbers each."""
+    views, rows, columns = place_codes(view_mask, map_hw, width, jnp.result_type(float))
     shape = (*view_mask.shape, *map_hw, width)
     parts = (views[:, :, None, None], rows[:, None], columns)
     return jnp.concatenate([jnp.broadcast_to(part, shape) for part in parts], -1)

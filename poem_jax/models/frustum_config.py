@@ -37,9 +37,13 @@ class Cuboid:
 
 
 DEXYCB_CUBOID = Cuboid((-1.2, -1.2, 0.2), (1.2, 1.2, 2.0))
-HO3D_CUBOID = Cuboid((-0.6, -0.6, 0.0), (0.6, 0.6, 1.2))
-OAKINK_CUBOID = Cuboid((-1.0, -1.0, 0.0), (1.0, 1.0, 1.5))
-"""The released models' position ranges; the first is also the paper's, in its ablation of two stages."""
+"""Also the paper's, in its ablation of one stage."""
+CUBOIDS = {
+    "dexycb": DEXYCB_CUBOID,
+    "ho3d": Cuboid((-0.6, -0.6, 0.0), (0.6, 0.6, 1.2)),
+    "oakink": Cuboid((-1.0, -1.0, 0.0), (1.0, 1.0, 1.5)),
+}
+"""Where hands are in the data sets that POEM v1 and its baselines were released for."""
 
 
 @dataclass(frozen=True)

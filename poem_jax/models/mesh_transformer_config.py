@@ -16,9 +16,8 @@ from poem_jax.models.config import (
 )
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import (
+    CUBOIDS,
     DEXYCB_CUBOID,
-    HO3D_CUBOID,
-    OAKINK_CUBOID,
     Cuboid,
     DepthSteps,
     FrustumConfig,
@@ -123,9 +122,6 @@ PE_MESHTR = MeshTransformerConfig(fusion=PositionEmbeddedFusion())
 FTL_MESHTR = MeshTransformerConfig(fusion=CanonicalFusion())
 """As the paper describes them."""
 
-RELEASED_SETS = {"dexycb": DEXYCB_CUBOID, "ho3d": HO3D_CUBOID, "oakink": OAKINK_CUBOID}
-"""Where hands are in the data sets that models were released for."""
-
 
 def pe_meshtr_release(dataset: str = "dexycb") -> MeshTransformerConfig:
     """Return the released PE-MeshTR of a data set."""
@@ -146,5 +142,5 @@ def ftl_meshtr_release(dataset: str = "dexycb") -> MeshTransformerConfig:
 
 
 def _cuboid_of(dataset: str) -> Cuboid:
-    require(dataset in RELEASED_SETS, f"`dataset` must be one of {', '.join(RELEASED_SETS)}; got {dataset!r}")
-    return RELEASED_SETS[dataset]
+    require(dataset in CUBOIDS, f"`dataset` must be one of {', '.join(CUBOIDS)}; got {dataset!r}")
+    return CUBOIDS[dataset]

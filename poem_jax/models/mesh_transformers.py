@@ -24,8 +24,13 @@ Where the paper says nothing, the release is followed: 6 layers of 8 heads, 2048
 - the grid has D = 32 depths of linearly increasing steps, as POEM v1's, on rays through the cells' centres;
 - FTL's tokens have the release's code of view, row and column in their keys: DETR's decoder has to know where
   a token stands, and canonical features do not say it;
-- FTL's fusing convolution is 1 x 1, without a norm;
-- the query embeddings are the paper's `E_X` alone, without METRO's template: the section says so of both;
+- FTL's points come from the map by a 1 x 1 convolution, for 256 channels are no multiple of 3, and its
+  fusing convolution is 1 x 1; neither has a norm or a ReLU;
+- the sines of a grid point begin with waves of twice the cuboid, and double in frequency;
+- `E_X` is what DETR calls query embeddings: added to queries and keys of every layer, the first of which
+  begins with zeros, where the paper's section on query points has it as the first layer's input;
+- the queries are `E_X` alone: of METRO the paper says that its tokens hold image features and the template's
+  coordinates, and "we adopt similar design", but then that the query tokens are `E_X`;
 - points are shares of the cuboid that the ablation of one stage names, starting from its middle.
 """
 
@@ -112,7 +117,7 @@ class MeshTransformer(nnx.Module):
         self.fusion = _FUSIONS[type(config.fusion), config.design](config, rngs=rngs)
         self.queries = (EmbeddedQueries if by_paper else ReferenceQueries)(config, rngs=rngs)
         self.decoder = DetrDecoder(config.decoder, config.width, rngs=rngs)
-        self.offsets = OffsetNetwork(config.width, rngs=rngs)
+        self.offsets = ReadOutNetwork(config.width, rngs=rngs)
         self.hand = HandConstants(hand)
 
     def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewMaps:
@@ -203,12 +208,12 @@ class EmbeddedPositions(nnx.Module):
 def grid_point_code(shares: Float[Array, "*batch 3"], width: int) -> Float[Array, "*batch c"]:
     """Encode points, given as shares of their space, by `width` / 2 sines, each followed by its cosine.
 
-    Of waves 2 pi x, 2 pi y, 2 pi z, then of twice the frequencies, and so on, until the channels are full:
-    the paper says no more than "a series of sinusoids". Frequencies rise, since points of one hand lie within
-    a tenth of the space.
+    Of waves pi x, pi y, pi z, then of twice the frequencies, and so on, until the channels are full: the
+    paper says no more than "a series of sinusoids". The longest wave is twice the space, so that its opposite
+    faces differ; frequencies rise, since points of one hand lie within a tenth of it.
     """
     wave = np.arange(width // 2)
-    angle = shares[..., wave % 3] * jnp.asarray(2 * np.pi * 2.0 ** (wave // 3), shares.dtype)
+    angle = shares[..., wave % 3] * jnp.asarray(np.pi * 2.0 ** (wave // 3), shares.dtype)
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], -1).reshape(*shares.shape[:-1], width)
 
 
@@ -235,7 +240,8 @@ class EncodedPositions(nnx.Module):
 
 class CanonicalMaps(nnx.Module):
     """Canonical fusion of the paper: B_W = (T^-1 reshape(B_cam, (W, H, C / 3, 3))), flattened; all views,
-    concatenated, go through one convolution, which gives each a map again.
+    concatenated, go through one convolution, which gives each a map again. B_cam has 3 numbers a point, from
+    the map by a linear layer alone: a coordinate may have either sign, as where T^-1 takes it.
 
     Its weights belong to a first, second, ... view: up to `num_views` may be valid, and they may not change
     places. Views that are not valid are taken for none.
@@ -245,14 +251,14 @@ class CanonicalMaps(nnx.Module):
         assert isinstance(config.fusion, CanonicalFusion)
         self.num_views, self.width = config.fusion.num_views, config.width
         channels = 3 * config.fusion.num_points
-        self.to_points = ConvNorm(self.width, channels, 1, bias=True, rngs=rngs)
+        self.to_points = Conv(self.width, channels, 1, bias=True, rngs=rngs)
         self.fuse = Conv(self.num_views * channels, self.num_views * self.width, 1, bias=True, rngs=rngs)
         self.place_code = PlaceCode(self.width, rngs=rngs)
 
     def __call__(self, maps: Float[Array, "batch view h w c"], cams: Cameras, mode: NormMode) -> Tokens:
         """Return the tokens; `config.view_range` says how many views there may be."""
         batch, view, h, w, _ = maps.shape
-        points = _per_image(self.to_points, maps, mode).reshape(batch, view, -1, 3)
+        points = self.to_points(maps.reshape(-1, h, w, self.width)).reshape(batch, view, -1, 3)
         moved = transform_points(invert_rigid(cams.T_cam_from_world), points).reshape(batch, view, h, w, -1)
         canonical, cams = valid_views_first(moved, cams)
         canonical = jnp.where(cams.view_mask[..., None, None, None], canonical, 0)
@@ -397,7 +403,7 @@ class ReferenceQueries(nnx.Module):
         return Queries(self.out(jax.nn.relu(self.hidden(code))), jax.nn.sigmoid(points))
 
 
-class OffsetNetwork(nnx.Module):
+class ReadOutNetwork(nnx.Module):
     """Three layers from embedding to the logits' offset, the same after every decoder layer."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:

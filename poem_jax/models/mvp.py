@@ -27,6 +27,14 @@ this house's choices where it is silent, `Design.RELEASE` is the authors' code. 
   mesh                   metres, the wrist at joint 0          shares of the cuboid, the wrist at joint 0,
                                                                stretched to metres with it
 
+Where both say nothing of the paper's form, decided here: trunk, number of layers, heads and points, dropout
+and the order within a layer are the release's, the cuboid is that of the paper's ablation of one stage;
+nothing is read behind a camera; the hand's numbers come from the embeddings of all 21 joints by two layers,
+anew after every decoder layer, and are small at first; its wrist stands at the regressed joint 0, and the
+other joints, too, stay as they were regressed; the 15 numbers of the fingers are directions of the hand's
+anatomy (`finger_directions`), with MANO's file as with the shipped hand: MANO's own components come with
+imported weights alone.
+
 So a sample of the released model sees its batch through that largest number (over valid views), and its
 hand parameters describe no hand in metres: they are not part of its prediction.
 

@@ -188,14 +188,14 @@ def reconstruct(
     return model.find_hands(seen, frame, mode, dropout_key=dropout_key, **draw.arguments())
 
 
-def check_view_count(config: ModelConfig, num_views: int, name: str = "`views`") -> None:
-    """Raise `ValueError` for a padded number of views that a system cannot take; `name` is what has them."""
+def check_view_count(config: ModelConfig, num_views: int) -> None:
+    """Raise `ValueError` for a padded number of views that a system cannot take."""
     least, most = config.view_range
     if num_views < least or (most is not None and num_views > most):
-        wanted = f"{least}" if least == most else f"{least} to {most}"
+        what_helps = "Pad with masked ones" if num_views < least else "Leave some out"
         raise ValueError(
-            f"{name} must have {wanted} views, as the layers of this {type(config).__name__} are made for; "
-            f"got {num_views}. Leave views out, pad with masked ones, or take a model for {num_views}"
+            f"`views` must have {config.views_in_words} views, as the layers of this {type(config).__name__} "
+            f"are made for; got {num_views}. {what_helps}, or take a model for {num_views}"
         )
 
 

@@ -50,8 +50,7 @@ from poem_jax.models.layers import (
     trunk_images,
 )
 from poem_jax.models.mesh_transformer_config import MeshTransformerConfig, PositionEmbeddedFusion
-from poem_jax.models.mesh_transformers import EmbeddedPositions
-from poem_jax.models.mesh_transformers import OffsetNetwork as MeshOffsetNetwork
+from poem_jax.models.mesh_transformers import EmbeddedPositions, ReadOutNetwork
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.poem_v1_config import (
     BasisFeatures,
@@ -328,7 +327,7 @@ class PaperTokens(nnx.Module):
         self.fusion = EmbeddedPositions(_as_mesh_transformer(config, config.decoder), rngs=rngs)
         self.embedding = _EMBEDDINGS[config.query_embedding](config, hand, rngs=rngs)
         self.decoder = DetrDecoder(config.decoder.detr, config.width, rngs=rngs)
-        self.offsets = MeshOffsetNetwork(config.width, rngs=rngs)
+        self.offsets = ReadOutNetwork(config.width, rngs=rngs)
 
     def __call__(self, scene: Scene) -> list[Float[Array, "batch query 3"]]:
         """Return the query points after every layer, metres in the primary camera's frame."""

@@ -3,6 +3,7 @@ Intersection Sphere"), the maps that they sample, and codes that tell where a sa
 """
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -144,11 +145,7 @@ def interleaved_code(shares: Float[Array, "*batch axis"], width: int) -> Float[A
 
 
 class ViewRowColumnCode(nnx.Module):
-    """A code of view number, row and column, mixed to the width of the map (release).
-
-    Positions count from 1 and are divided by their number, which for the views is that of the sample's valid
-    ones. A code is F / 2 sines followed by F / 2 cosines of the same frequencies, F = c / 2.
-    """
+    """A code of view number, row and column, c / 2 numbers each, mixed to the width of the map (release)."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         self.mix = Conv(3 * (width // 2), width, 1, bias=True, rngs=rngs)
@@ -159,15 +156,29 @@ class ViewRowColumnCode(nnx.Module):
         """Return what is added to each view's map; the mix is linear, so each axis is mixed alone."""
         assert self.mix.bias is not None
         to_view, to_row, to_column = jnp.split(self.mix.kernel[...][0, 0], 3)
-        code = len(to_view)
-        view_number = jnp.cumsum(view_mask, -1).astype(to_view.dtype)
-        view_count = jnp.sum(view_mask, -1, keepdims=True).astype(to_view.dtype)
-        views = axis_code(view_number, view_count, code) @ to_view
-        rows, columns = (
-            axis_code(jnp.arange(1.0, size + 1), jnp.array(float(size)), code) @ mix
-            for size, mix in zip(map_hw, (to_row, to_column), strict=True)
+        views, rows, columns = place_codes(view_mask, map_hw, len(to_view), to_view.dtype)
+        return (
+            (views @ to_view)[:, :, None, None]
+            + (rows @ to_row)[:, None]
+            + (columns @ to_column + self.mix.bias[...])
         )
-        return views[:, :, None, None] + rows[:, None] + (columns + self.mix.bias[...])
+
+
+def place_codes(
+    view_mask: Bool[Array, "batch view"], map_hw: tuple[int, int], width: int, dtype: Any
+) -> tuple[Float[Array, "batch view c"], Float[Array, "h c"], Float[Array, "w c"]]:
+    """Encode number of the view, row and column, `width` sines and cosines each.
+
+    Numbers count from 1 and are divided by how many there are, which for the views is the sample's valid
+    ones: so the code depends on how many views there are, and masked views do not count. What stands at
+    masked views means nothing.
+    """
+    number = jnp.cumsum(view_mask, -1).astype(dtype)
+    count = jnp.sum(view_mask, -1, keepdims=True).astype(dtype)
+    rows, columns = (
+        axis_code(jnp.arange(1, size + 1, dtype=dtype), jnp.asarray(size, dtype), width) for size in map_hw
+    )
+    return axis_code(number, count, width), rows, columns
 
 
 def axis_code(

@@ -35,7 +35,7 @@ from poem_jax.models.config import (
     Stem,
     ViewWeights,
 )
-from poem_jax.models.frustum_config import DEXYCB_CUBOID, HO3D_CUBOID, OAKINK_CUBOID
+from poem_jax.models.frustum_config import CUBOIDS
 from poem_jax.models.mesh_transformer_config import (
     FTL_MESHTR,
     PE_MESHTR,
@@ -112,9 +112,9 @@ V2_NANO = Config(
     basis=BasisConfig(num_points=2048),
 )
 
-CUBOIDS = {"dexycb": DEXYCB_CUBOID, "ho3d": HO3D_CUBOID, "oakink": OAKINK_CUBOID}
-"""Where hands are in the data sets that models of POEM v1 and its baselines were released for."""
 DATASETS = tuple(CUBOIDS)
+RELEASED_VIEWS = {"dexycb": 8, "ho3d": 5, "oakink": 4}
+"""Cameras of these data sets, which the layers of a released MvP are made for."""
 _RELEASED_EMBEDDINGS = {
     "v1": QueryEmbedding.VERTEX,
     "v1-g-emb": QueryEmbedding.GLOBAL,
@@ -186,14 +186,15 @@ def preset(name: str) -> ModelConfig:
     return PRESETS[name]
 
 
-def released(variant: str, *, dataset: str = "dexycb", num_views: int = 8) -> ModelConfig:
+def released(variant: str, *, dataset: str = "dexycb", num_views: int | None = None) -> ModelConfig:
     """Return the configuration of a released model.
 
     Args:
         variant: one of `RELEASED`.
         dataset: one of `DATASETS`: of POEM v1 and the baselines, what it was trained on; of no account for
             POEM v2.
-        num_views: views that the layers of MvP are made for; of no account for the others.
+        num_views: views that the layers of MvP are made for, None = the data set's (`RELEASED_VIEWS`); of no
+            account for the others.
 
     Raises:
         ValueError: no such variant or data set.
@@ -202,4 +203,4 @@ def released(variant: str, *, dataset: str = "dexycb", num_views: int = 8) -> Mo
         raise ValueError(f"`variant` must be one of {', '.join(RELEASED)}; got {variant!r}")
     if dataset not in DATASETS:
         raise ValueError(f"`dataset` must be one of {', '.join(DATASETS)}; got {dataset!r}")
-    return RELEASED[variant](dataset, num_views)
+    return RELEASED[variant](dataset, RELEASED_VIEWS[dataset] if num_views is None else num_views)

@@ -240,12 +240,16 @@ class TrainConfig:
             f"got {self.first_stage_steps}",
         )
         least, most = self.model.view_range
-        counts = {shape.num_views for shape in self.data.batches}
-        counts |= set(run.validation_views) if run.validate_every else set()
+        counts = sorted({shape.num_views for shape in self.data.batches})
         require(
             all(least <= n <= (most or n) for n in counts),
-            f"this {type(self.model).__name__} is made for {least} to {most} views, in `data.batches` and "
-            f"`train.validation_views` alike; got {sorted(counts)}",
+            f"`num_views` of `data.batches` must be {self.model.views_in_words}, as the layers of this "
+            f"{type(self.model).__name__} are made for; got {counts}. `min_views` gives samples fewer",
+        )
+        require(
+            not run.validate_every or max(run.validation_views) <= (most or max(run.validation_views)),
+            f"`train.validation_views` must not exceed {most}, which the layers of this "
+            f"{type(self.model).__name__} are made for; got {run.validation_views}",
         )
         max_views = max(shape.num_views for shape in self.data.batches)
         require(

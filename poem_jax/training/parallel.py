@@ -38,11 +38,17 @@ def check_batch_sizes(config: TrainConfig, mesh: Mesh) -> None:
     """Insist that every batch can be split evenly over the devices of this process.
 
     Raises:
-        ValueError: it cannot, or there are several processes.
+        ValueError: it cannot, or there are several processes, or the model's samples depend on each other.
     """
     if jax.process_count() > 1:
         raise ValueError(
             f"training runs in one process on the devices of one machine; got {jax.process_count()} processes"
+        )
+    if config.model.couples_samples and mesh.size > 1:
+        raise ValueError(
+            f"a batch of this {type(config.model).__name__} must stay on one device, for its samples depend "
+            f"on each other; got {mesh.size} devices. Show JAX one (CUDA_VISIBLE_DEVICES, "
+            "`train.host_devices`)"
         )
     sizes = [shape.batch_size for shape in config.data.batches]
     if any(size % mesh.size for size in sizes):

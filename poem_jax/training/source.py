@@ -45,11 +45,13 @@ def choose_shape(config: DataConfig, rng: np.random.Generator) -> BatchShape:
 
 
 def validation_batches(config: TrainConfig, num_views: int) -> list[MultiViewBatch]:
-    """Draw the held-out samples of a validation, `num_views` of each; the same ones every time."""
+    """Draw the held-out samples of a validation, `num_views` of each, padded with masked views to what the
+    model is made for; the same ones every time."""
     dataset = SyntheticDataset(config.data.synthetic, seed=config.train.validation_seed)
     size = max(shape.batch_size for shape in config.data.batches)
     count = -(-config.train.validation_samples // size)
+    padded = max(num_views, config.model.view_range[0])
     return [
-        collate([dataset.sample(size * i + j, num_views=num_views) for j in range(size)], num_views)
+        collate([dataset.sample(size * i + j, num_views=num_views) for j in range(size)], padded)
         for i in range(count)
     ]

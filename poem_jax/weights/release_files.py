@@ -37,6 +37,9 @@ class Assets(NamedTuple):
 class Imported(NamedTuple):
     """What `import_release` found."""
 
+    model: str
+    """The variant, and of those that were released for several data sets which, and for how many views if
+    its layers are made for a number."""
     num_read: int
     """Arrays of the checkpoint that went into the model."""
     num_ignored: int
@@ -52,8 +55,8 @@ def import_release(
     mano: str | Path,
     out: str | Path,
     assets: str | Path | None = None,
-    dataset: str = "dexycb",
-    num_views: int = 8,
+    dataset: str | None = None,
+    num_views: int | None = None,
     accept_anchors: bool = False,
     overwrite: bool = False,
 ) -> Imported:
@@ -65,8 +68,8 @@ def import_release(
         mano: `MANO_RIGHT.pkl`, or an `.npz` with MANO's names.
         out: folder to make; on failure nothing is left there, and what stood there stays.
         assets: folder with `bps.npy`, `anchor.npy`, `anchor_idx.npy`; POEM v2 alone, and needed there.
-        dataset: as in `convert`.
-        num_views: as in `convert`.
+        dataset: as in `convert`, None = DexYCB; must be None for POEM v2.
+        num_views: as in `convert`; must be None for all but MvP.
         accept_anchors: take anchors that do not lie on the template of `mano` and of the checkpoint.
         overwrite: replace the model folder at `out`.
 
@@ -74,18 +77,19 @@ def import_release(
         FileNotFoundError: a file is missing.
         ValueError: files that are damaged, hostile or do not belong together, or `out` exists.
     """
-    out, config = Path(out), released(variant, dataset=dataset, num_views=num_views)
+    name = dataset or "dexycb"
+    out, config = Path(out), released(variant, dataset=name, num_views=num_views)
+    _check_options(variant, config, dataset, num_views)
     _check_folder(out, overwrite)
     hand, constants = mano_file.load(mano), _assets(assets, config, variant)
     state = load_state_dict(checkpoint)
-    model_of = {"dataset": dataset, "num_views": num_views}
-    _, params = convert(state, variant, mano=hand, **constants, **model_of)
+    _, params = convert(state, variant, mano=hand, **constants, dataset=name, num_views=num_views)
     if isinstance(config, Config) and not accept_anchors:
         check_anchors(config, params, hand)
     store.save(out, config, params, overwrite=overwrite)
     num_read = _num_read(state, config)
     num_parameters = sum(leaf.size for leaf in jax.tree.leaves(params["trainable"]))
-    return Imported(num_read, len(state) - num_read, num_parameters)
+    return Imported(_described(variant, config, name), num_read, len(state) - num_read, num_parameters)
 
 
 def export_release(model: str | Path, out: str | Path, *, overwrite: bool = False) -> int:
@@ -112,6 +116,26 @@ def export_release(model: str | Path, out: str | Path, *, overwrite: bool = Fals
     state = export_state_dict(*store.load(model))
     save_state_dict(out, state)
     return len(state)
+
+
+def _check_options(variant: str, config: ModelConfig, dataset: str | None, num_views: int | None) -> None:
+    """Refuse what was said for nothing: it was meant for another variant."""
+    if isinstance(config, Config) and dataset is not None:
+        raise ValueError(f"{variant} was released for all data sets at once; leave out --dataset")
+    if num_views is not None and not _takes_one_view_count(config):
+        raise ValueError(f"{variant} takes any number of views; leave out --num-views")
+
+
+def _takes_one_view_count(config: ModelConfig) -> bool:
+    least, most = config.view_range
+    return least == most
+
+
+def _described(variant: str, config: ModelConfig, dataset: str) -> str:
+    if isinstance(config, Config):
+        return variant
+    views = f" for {config.views_in_words} views" if _takes_one_view_count(config) else ""
+    return f"{variant} of {dataset}{views}"
 
 
 def _assets(folder: str | Path | None, config: ModelConfig, variant: str) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -104,7 +105,7 @@ def load(path: str | os.PathLike, *, expected: ModelConfig | None = None) -> tup
             or another config than `expected`.
     """
     path = Path(path)
-    config = _read_config(path)
+    config = read_config(path)
     if expected is not None and expected != config:
         raise ValueError(
             f"checkpoint of another config at {path}: {_config_difference(expected, config)}. "
@@ -206,7 +207,14 @@ def _narrowed(name: str, leaf: np.ndarray, dtype: Any) -> np.ndarray:
     return leaf.astype(dtype)
 
 
-def _read_config(path: Path) -> ModelConfig:
+def read_config(path: str | os.PathLike) -> ModelConfig:
+    """Read the config of a model that `save` wrote, and none of its weights.
+
+    Raises:
+        FileNotFoundError: no such folder, or it misses its config or its arrays.
+        ValueError: not a config.
+    """
+    path = Path(path)
     file = path / CONFIG_FILE
     for needed in (path, file, path / ARRAYS_FOLDER):
         if not needed.exists():
@@ -238,10 +246,21 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 def _config_difference(expected: ModelConfig, got: ModelConfig) -> str:
     if type(expected) is not type(got):
         return f"expected a {type(expected).__name__}, got a {type(got).__name__}"
-    ours, theirs = json.loads(to_json(expected)), json.loads(to_json(got))
-    lines = [
-        f"`{key}` expected {ours.get(key)}, got {theirs.get(key)}"
-        for key in ours.keys() | theirs.keys()
-        if ours.get(key) != theirs.get(key)
-    ]
-    return "; ".join(sorted(lines))
+    return "; ".join(_differences(json.loads(to_json(expected)), json.loads(to_json(got)), ""))
+
+
+def _differences(expected: Any, got: Any, path: str) -> Iterator[str]:
+    """List by dotted name where two configs in their JSON form differ; of a part that is of another class,
+    only that it is."""
+    if expected == got:
+        return
+    are_objects = isinstance(expected, dict) and isinstance(got, dict)
+    if not are_objects or expected.get("kind") != got.get("kind"):
+        yield f"`{path}` expected {_named(expected)}, got {_named(got)}"
+        return
+    for key in expected:
+        yield from _differences(expected[key], got[key], f"{path}.{key}" if path else key)
+
+
+def _named(value: Any) -> Any:
+    return f"a {value['kind']}" if isinstance(value, dict) else value

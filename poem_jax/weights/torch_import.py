@@ -27,7 +27,7 @@ from poem_jax.models.mesh_transformer_config import MeshTransformerConfig
 from poem_jax.models.mvp_config import MvpConfig
 from poem_jax.models.network import constants_of, describe, with_static_indices
 from poem_jax.models.poem_v1_config import PoemV1Config
-from poem_jax.models.presets import DATASETS, RELEASED, released
+from poem_jax.models.presets import DATASETS, RELEASED, RELEASED_VIEWS, released
 from poem_jax.typing import Float, Int, Params
 from poem_jax.weights.name_table import NameRow, read_rows, write_rows
 from poem_jax.weights.release_keys import HEAD, is_parametric
@@ -65,6 +65,8 @@ _IGNORED_ENDINGS = ("embeddings.position_ids",)
 """Written by older versions of the library that the decoder came from."""
 _CLASSIFIER = ("incre_modules.", "downsamp_modules.", "final_layer.", "classifier.", "fc.")
 """Heads of ImageNet checkpoints."""
+_RESNET_STAGES = 4
+"""Of every ResNet in torchvision."""
 
 _log = logging.getLogger(__name__)
 
@@ -102,7 +104,7 @@ def convert(
     anchor_points: Float[np.ndarray, "*one anchor 3"] | None = None,
     anchor_indices: Int[np.ndarray, "*one anchor"] | None = None,
     dataset: str = "dexycb",
-    num_views: int = 8,
+    num_views: int | None = None,
 ) -> tuple[ModelConfig, Params]:
     """Turn a released state dict into a model that `apply` runs.
 
@@ -119,7 +121,8 @@ def convert(
         anchor_indices: likewise `anchor_idx.npy`.
         dataset: POEM v1 and the baselines: what the model was trained on, one of `presets.DATASETS`. It fixes
             the space in which hands are sought, which the arrays do not tell.
-        num_views: MvP alone: views that its layers are made for (8 in DexYCB, 5 in HO3D, 4 in OakInk).
+        num_views: MvP alone: views that its layers are made for, None = as released (8 in DexYCB, 5 in HO3D,
+            4 in OakInk); of another number a warning is logged.
 
     Returns: the config and the parameters, float32.
 
@@ -135,6 +138,15 @@ def convert(
         "anchor_indices": anchor_indices,
     }
     _check_assets(assets, variant, needed=isinstance(config, Config))
+    if config != released(variant, dataset=dataset):
+        _log.warning(
+            "the released %s of %s is made for %d views, not for %s: is `dataset` right? The space in which "
+            "hands are sought is that of the data set",
+            variant,
+            dataset,
+            RELEASED_VIEWS[dataset],
+            num_views,
+        )
     hand, names = _right_hand(mano), names_of(config)
     state = _without_prefix(state_dict)
     leaves, problems = read_rows(names.rows, state, expected_leaves(config))
@@ -193,7 +205,7 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, para
 
     Args:
         state_dict: HRNet's own names, or torchvision's for a ResNet; names may start with `module.`. The
-            classifier is ignored.
+            classifier is ignored, and so are the stages behind the last one of a ResNet that is cut short.
         config: the model; its trunk must be the one that the weights are of.
         params: its parameters.
 
@@ -204,11 +216,11 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, para
     state = _without_prefix(state_dict)
     rows = list(trunk_rows(trunk))
     leaves, problems = read_rows(rows, state, expected_leaves(config))
-    known = {row.source for row in rows}
+    known, ignored = {row.source for row in rows}, _CLASSIFIER + _stages_behind(trunk)
     problems += [
         f"{name}: unknown, got shape {array.shape}"
         for name, array in state.items()
-        if name not in known and not name.startswith(_CLASSIFIER) and not name.endswith("num_batches_tracked")
+        if name not in known and not name.startswith(ignored) and not name.endswith("num_batches_tracked")
     ]
     if problems:
         raise ValueError(
@@ -217,6 +229,13 @@ def import_trunk(state_dict: Mapping[str, np.ndarray], config: ModelConfig, para
         )
     _check_finite(leaves)
     return unflatten({**flatten(params), **leaves}, params)
+
+
+def _stages_behind(trunk: HRNetConfig | ResNetConfig) -> tuple[str, ...]:
+    """Return how the names begin of torchvision's stages that a ResNet leaves out at its end."""
+    if isinstance(trunk, HRNetConfig):
+        return ()
+    return tuple(f"layer{stage + 1}." for stage in range(len(trunk.blocks), _RESNET_STAGES))
 
 
 def check_anchors(config: Config, params: Params, hand: HandModel) -> None:
@@ -283,17 +302,20 @@ def _differing_aliases(state: dict[str, np.ndarray], names: Names) -> list[str]:
 
 
 def _report(problems: list[str], state: dict[str, np.ndarray], variant: str, most_views: int | None) -> str:
-    looks_like = _guess(state)
+    looks_like, views = _guess(state)
     hint = "Is the file cut short, or of another model?"
     if most_views is not None:
         hint = f"Is the file cut short, of another model, or not of `num_views` = {most_views}?"
     if looks_like not in (None, variant):
         hint = f"The state dict looks like {looks_like}: pass that variant."
+    if views not in (None, most_views):
+        hint = f"{hint} It looks made for {views} views: pass its data set, or that as `num_views`."
     return f"the state dict does not fit {variant}: {_shown(problems)}. {hint}"
 
 
-def _guess(state: dict[str, np.ndarray]) -> str | None:
-    """Tell the variant by the width of the query embeddings and by the parametric head."""
+def _guess(state: dict[str, np.ndarray]) -> tuple[str | None, int | None]:
+    """Tell the variant by the width of the query embeddings and by the parametric head, and the number of
+    views of one that is made for a number."""
     table = state.get(f"{HEAD}query_feat_embedding.weight")
     if table is None or table.ndim != 2:
         return _guess_by_names(state)
@@ -304,21 +326,23 @@ def _guess(state: dict[str, np.ndarray]) -> str | None:
             table.shape[1],
             parametric,
         ):
-            return variant
-    return None
+            return variant, None
+    return None, None
 
 
-def _guess_by_names(state: dict[str, np.ndarray]) -> str | None:
+def _guess_by_names(state: dict[str, np.ndarray]) -> tuple[str | None, int | None]:
     """Return the variant, not of POEM v2, that has exactly these names and shapes, if one has."""
     for variant in RELEASED:
-        config = released(variant)
-        if isinstance(config, Config):
-            continue
-        names = names_of(config)
-        _, problems = read_rows(names.rows, state, expected_leaves(config))
-        if not problems and not _unknown_or_unlike(state, names):
-            return variant
-    return None
+        for config in {released(variant, num_views=views): None for views in RELEASED_VIEWS.values()}:
+            if isinstance(config, Config):
+                continue
+            names = names_of(config)
+            if any(row.source not in state for row in names.rows):
+                continue
+            _, problems = read_rows(names.rows, state, expected_leaves(config))
+            if not problems and not _unknown_or_unlike(state, names):
+                return variant, config.view_range[1]
+    return None, None
 
 
 def _shown(problems: list[str]) -> str:

@@ -33,6 +33,7 @@ from poem_jax.models.mesh_transformers import (
     EmbeddedPositions,
     MeshTransformer,
     PixelUnitMaps,
+    grid_point_code,
 )
 from poem_jax.models.world_frame import enter_working_frame
 
@@ -324,11 +325,16 @@ def test_position_embedded_fusion_of_the_paper(make_scene):
             for d, depth in enumerate((0.2, 0.2 + 1.8 * 2 / 6)):
                 ray = np.linalg.inv(K[view]) @ np.array([8 * column + 4, 8 * row + 4, 1.0])
                 share = (R[view].T @ (depth * ray - t[view]) - low) / (high - low)
-                angles = 2 * np.pi * np.array([*share, 2 * share[0]])
+                angles = np.pi * np.array([*share, 2 * share[0]])
                 waves = np.stack([np.sin(angles), np.cos(angles)], -1).ravel()
                 expected[8 * d : 8 * d + 8] += waves
             token = tokens.values[0, 16 * view + 4 * row + column]
             np.testing.assert_allclose(token, expected, atol=2e-5)
+
+
+def test_opposite_faces_of_the_cuboid_have_other_codes():
+    faces = grid_point_code(jnp.asarray([[0.0, 0.5, 0.5], [1.0, 0.5, 0.5]]), 8)
+    assert np.abs(faces[0] - faces[1]).max() > 1
 
 
 def _conv_norm(layer, x: np.ndarray) -> np.ndarray:
@@ -341,18 +347,25 @@ def _conv_norm(layer, x: np.ndarray) -> np.ndarray:
     return np.maximum(y, 0) if layer.relu else y
 
 
+def _linear(kernel: np.ndarray, bias: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return x @ kernel + bias
+
+
 def test_canonical_fusion_of_the_paper(make_scene):
     """Every view's points by T^-1; all views through one convolution, whose other weights meet nothing."""
     cams, _, R, t = _cameras(make_scene)
     fusion = _fusion("ftl", CanonicalMaps)
     tokens = fusion(MAPS, cams, NormMode())
-    kernel, bias = np.asarray(fusion.fuse.kernel[...])[0, 0], np.asarray(fusion.fuse.bias[...])
+    to_points, fuse = (
+        (np.asarray(layer.kernel[...])[0, 0], np.asarray(layer.bias[...]))
+        for layer in (fusion.to_points, fusion.fuse)
+    )
     for row, column in ((0, 0), (2, 3)):
         joined = np.zeros((5, 3, 3))
         for view in range(3):
-            points = _conv_norm(fusion.to_points, MAPS[0, view, row, column]).reshape(3, 3)
+            points = _linear(*to_points, MAPS[0, view, row, column]).reshape(3, 3)
             joined[view] = (points - t[view]) @ R[view]
-        fused = (joined.ravel() @ kernel + bias).reshape(5, WIDTH)
+        fused = _linear(*fuse, joined.ravel()).reshape(5, WIDTH)
         for view in range(3):
             token = tokens.values[0, 16 * view + 4 * row + column]
             np.testing.assert_allclose(token, fused[view], atol=2e-5)

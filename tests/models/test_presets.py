@@ -7,8 +7,9 @@ import jax
 import pytest
 
 from poem_jax.models.config import Config
+from poem_jax.models.frustum_config import DepthSteps
 from poem_jax.models.network import describe
-from poem_jax.models.presets import PRESETS, preset
+from poem_jax.models.presets import PRESETS, preset, released
 
 
 def _count(tree) -> int:
@@ -26,6 +27,30 @@ def test_the_documents_name_every_preset_and_count_its_parameters():
     assert rows == counted
     readme = (ROOT / "README.md").read_text()
     assert [name for name in PRESETS if f"`{name}`" not in readme] == []
+
+
+DATA_SETS = {
+    "dexycb": ((-1.2, -1.2, 0.2), (1.2, 1.2, 2.0), 8),
+    "ho3d": ((-0.6, -0.6, 0.0), (0.6, 0.6, 1.2), 5),
+    "oakink": ((-1.0, -1.0, 0.0), (1.0, 1.0, 1.5), 4),
+}
+"""The released configs' POSITION_RANGE, whose last axis is that of the grids' depths, and cameras."""
+
+
+@pytest.mark.parametrize("dataset", DATA_SETS)
+def test_released_models_seek_hands_where_their_data_set_has_them(dataset):
+    low, high, cameras = DATA_SETS[dataset]
+    v1, pe, ftl, mvp = (
+        released(variant, dataset=dataset) for variant in ("v1", "pe-meshtr", "ftl-meshtr", "mvp")
+    )
+    for space in (v1.space, pe.cuboid, ftl.cuboid, mvp.cuboid):
+        assert (space.low, space.high) == (low, high)
+    depths = (low[2], high[2])
+    grids = (v1.basis.frustum, 32, DepthSteps.LINEAR), (pe.fusion.frustum, 64, DepthSteps.LINEAR_INCREASING)
+    for grid, count, steps in grids:
+        assert (grid.start, grid.end) == depths
+        assert (grid.num_depths, grid.steps, grid.cell_offset) == (count, steps, 0.0)
+    assert mvp.view_range == (cameras, cameras)
 
 
 def test_tiny_fits_into_the_package():

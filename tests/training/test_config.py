@@ -85,7 +85,8 @@ def test_the_step_of_every_experiment_fits_its_model_and_data(name):
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
         lambda x: (x.shape, x.dtype), state
     )
-    assert {"loss", "mpvpe_mm", "keypoint_px", "gradient_norm"} <= metrics.keys()
+    assert {"loss", "mpvpe_mm", "gradient_norm"} <= metrics.keys()
+    assert ("keypoint_px" in metrics) == config.model.triangulates
     assert all(value.shape == () for value in metrics.values())
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,9 @@ import pytest
 
 import poem_jax
 from poem_jax.models.apply import init
+from poem_jax.models.mesh_transformer_config import FTL_MESHTR, PE_MESHTR, pe_meshtr_release
+from poem_jax.models.mvp_config import MvpConfig
+from poem_jax.models.presets import preset
 from poem_jax.weights import store
 from poem_jax.weights.config_json import to_json
 from tests.micro import MICRO
@@ -220,6 +224,30 @@ def test_a_config_that_is_not_the_arrays_own_is_a_value_error(saved):
 def test_an_unexpected_config_is_a_value_error(saved):
     with pytest.raises(ValueError, match=r"checkpoint of another config at .*`width` expected 32, got 16"):
         store.load(saved, expected=replace(MICRO, width=32))
+
+
+@pytest.mark.parametrize(
+    ("expected", "got", "differing"),
+    [
+        (
+            pe_meshtr_release(),
+            pe_meshtr_release("oakink"),
+            "`fusion.frustum.start` expected 0.2, got 0.0; `fusion.frustum.end` expected 2.0, got 1.5; "
+            "`cuboid.low` expected [-1.2, -1.2, 0.2], got [-1.0, -1.0, 0.0]; "
+            "`cuboid.high` expected [1.2, 1.2, 2.0], got [1.0, 1.0, 1.5]",
+        ),
+        (PE_MESHTR, FTL_MESHTR, "`fusion` expected a PositionEmbeddedFusion, got a CanonicalFusion"),
+        (MvpConfig(), MvpConfig(num_views=5), "`num_views` expected 8, got 5"),
+        (preset("tiny"), replace(preset("tiny"), joint_decoder=None), "a JointDecoderConfig, got None"),
+        (PE_MESHTR, MvpConfig(), "expected a MeshTransformerConfig, got a MvpConfig"),
+    ],
+    ids=["another data set", "another fusion", "another number of views", "without a part", "another system"],
+)
+def test_another_config_is_told_by_the_fields_that_differ(tmp_path, expected, got, differing):
+    (tmp_path / "ckpt").mkdir()
+    (tmp_path / "config.json").write_text(to_json(got))
+    with pytest.raises(ValueError, match=re.escape(f"{differing}. Build")):
+        store.load(tmp_path, expected=expected)
 
 
 def test_shipped_weights_are_small_and_load():

@@ -13,7 +13,7 @@ import pytest
 import poem_jax
 from poem_jax.hand import mano_file
 from poem_jax.hand.model import mirror
-from poem_jax.models.config import Config, HRNetConfig, ResNetConfig
+from poem_jax.models.config import Config, HRNetConfig, ModelConfig, ResNetConfig
 from poem_jax.models.network import describe
 from poem_jax.models.presets import preset
 from poem_jax.typing import Params
@@ -301,7 +301,7 @@ TRUNKS = {
 """Trunks, where their arrays come from, and how many torchvision's state dicts hold."""
 
 
-def empty_params(config: Config) -> Params:
+def empty_params(config: ModelConfig) -> Params:
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), describe(config))
 
 
@@ -326,6 +326,17 @@ def test_trunks_take_all_arrays_and_leave_the_rest(trunk) -> None:
     assert left == set(back)
     for name, leaf in flatten(filled).items():
         assert leaf.any() == (".trunk." in name), name
+
+
+@pytest.mark.parametrize("name", ["pe-meshtr-release", "ftl-meshtr-release"])
+def test_a_trunk_that_is_cut_short_takes_its_stages_of_a_whole_one(name: str) -> None:
+    config, state = preset(name), resnet_state(ResNetConfig.resnet34())
+    filled = flatten(import_trunk(state, config, empty_params(config)))
+    for source, array in write_rows(list(trunk_rows(config.backbone)), filled).items():
+        np.testing.assert_array_equal(array, state[source], err_msg=source)
+    state["layer2.9.conv1.weight"] = np.zeros(3)
+    with pytest.raises(ValueError, match=r"1 problems: layer2\.9\.conv1\.weight: unknown"):
+        import_trunk(state, config, empty_params(config))
 
 
 def test_trunks_that_do_not_fit(trunk) -> None:

@@ -103,5 +103,6 @@ def test_data_sets_and_folders(tmp_path) -> None:
 def test_checkpoints_of_others_are_named() -> None:
     with pytest.raises(ValueError, match=r"does not fit v1: .*looks like v1-g-emb: pass that variant"):
         convert(state_dict("poem_g"), "v1", mano=REFERENCE_V1 / "fake_mano.npz")
-    with pytest.raises(ValueError, match=r"does not fit mvp: .*not of `num_views` = 5\?"):
+    hint = r"does not fit mvp: .*not of `num_views` = 5\? It looks made for 4 views"
+    with pytest.raises(ValueError, match=hint):
         imported("mvp4", num_views=5)

@@ -1,0 +1,3 @@
+"""`mvp_synthetic`, which stands in poem_jax/experiments/."""
+
+from poem_jax.experiments.mvp_synthetic import config as config

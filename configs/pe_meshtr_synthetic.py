@@ -1,0 +1,3 @@
+"""`pe_meshtr_synthetic`, which stands in poem_jax/experiments/."""
+
+from poem_jax.experiments.pe_meshtr_synthetic import config as config
