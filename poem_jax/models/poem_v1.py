@@ -151,6 +151,7 @@ class PoemV1(nnx.Module):
             start.valid & basis.found & jnp.any(cams.view_mask, -1),
             jnp.stack(layers, 1),
             parameters=None,
+            reference_mask=start.solved,
         )
         return leave_working_frame(found, frame, self.hand.model(), self.config.query_order)
 

@@ -47,7 +47,9 @@ class Start(NamedTuple):
     root: Float[Array, "batch 3"] | None
     """None where there is no first stage."""
     joints: Float[Array, "batch 21 3"] | None
-    """As triangulated; zero where they could not be."""
+    """As triangulated; what stands where they could not be means nothing."""
+    solved: Bool[Array, "batch 21"] | None
+    """Which could be."""
     valid: Bool[Array, " batch"]
 
 
@@ -101,7 +103,7 @@ class TriangulatedStart(nnx.Module):
         root, valid = root_point(joints, solved, frame.known_root, jnp.asarray(cams.view_mask))
         about_root = jnp.where(solved[..., None], joints - root[:, None], 0)
         queries = join_queries(self.mesh(about_root), about_root, self.order) + root[:, None]
-        return Start(queries, root, root, joints, valid)
+        return Start(queries, root, root, joints, solved, valid)
 
 
 class ReleaseStart(nnx.Module):
@@ -122,7 +124,8 @@ class ReleaseStart(nnx.Module):
         wrist = joints[:, WRIST, None]
         about_wrist = joints - wrist
         queries = join_queries(self.mesh(about_wrist), about_wrist, self.order) + wrist
-        return Start(queries, self._centre(queries), joints[:, ROOT_JOINT], joints, jnp.all(solved, -1))
+        root, centre = joints[:, ROOT_JOINT], self._centre(queries)
+        return Start(queries, centre, root, joints, solved, jnp.all(solved, -1))
 
     def _centre(self, queries: Float[Array, "batch query 3"]) -> Float[Array, "batch 3"]:
         by_axis = jnp.swapaxes(queries, 1, 2)
@@ -147,7 +150,7 @@ class LearnedStart(nnx.Module):
             jnp.broadcast_to(jnp.asarray(leaf, points.dtype), (batch, *np.shape(leaf)))
             for leaf in (points, np.array(self.origin))
         )
-        return Start(queries, centre, None, None, jnp.ones(batch, bool))
+        return Start(queries, centre, None, None, None, jnp.ones(batch, bool))
 
 
 # Coordinates in which the second stage works.

@@ -248,7 +248,7 @@ def test_without_a_key_it_is_key_0(make_scene):
     cams = Cameras(*map(jnp.asarray, make_scene(1, 4)[1]))
     grid = frustum_grid(V1.basis.frustum, cams, V1.map_hw, V1.image_hw)
     centre = jnp.mean(grid, (1, 2, 3, 4))
-    start = Start(jnp.zeros((1, NUM_QUERIES, 3)), centre, None, None, jnp.ones(1, bool))
+    start = Start(jnp.zeros((1, NUM_QUERIES, 3)), centre, None, None, None, jnp.ones(1, bool))
     default, zero, one = (
         module._basis(None, grid, start, cams, key).index
         for key in (None, jax.random.key(0), jax.random.key(1))

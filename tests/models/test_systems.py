@@ -25,6 +25,7 @@ NOT_THERE = (
     "keypoints_px",
     "heat_maps",
     "reference_joints_world",
+    "reference_joints_mask",
     "pose",
     "shape",
     "translation",
