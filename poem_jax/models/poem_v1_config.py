@@ -262,11 +262,20 @@ class PoemV1Config(ModelConfig):
         return self.triangulates and self.design is Design.PAPER
 
     @property
+    def needs_all_joints(self) -> bool:
+        """The paper's model starts joints that it cannot triangulate at the root; the release does not."""
+        return self.triangulates and self.design is Design.RELEASE
+
+    @property
     def grid_draw(self) -> GridDraw | None:
         """How basis points are drawn from the cameras' grids; None = PE-MeshTR's decoder needs none."""
         if not isinstance(self.decoder, PointDecoderConfig):
             return None
-        return GridDraw(self.basis.num_points, self._points_per_view)
+        if isinstance(self.first_stage, OneStageConfig):
+            about = f"`first_stage.origin` = {self.first_stage.origin}, metres before the primary camera"
+        else:
+            about = "the hand's root joint" if self.takes_root else "the triangulated hand"
+        return GridDraw(self.basis.num_points, self._points_per_view, about)
 
 
 V1 = PoemV1Config()

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle, transform_points
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT, split_queries
+from poem_jax.models import apply as apply_checks
 from poem_jax.models.config import Design, FrozenNorms, ResNetConfig, RootConfig, Stem
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum import frustum_grid
@@ -267,6 +269,44 @@ def test_a_ball_without_points_is_not_valid_and_finite(name, scene):
     assert not found.valid.any()
     assert np.isfinite(found.layers_world).all()
     assert (np.abs(found.reference_joints_world).max((1, 2)) > 0).all()
+
+
+_EMPTY = r"lie in the ball about {}; in samples \[1\] none does"
+
+
+@pytest.mark.parametrize(
+    ("name", "unsolved", "root", "message"),
+    [
+        (
+            "release",
+            [4, 8],
+            None,
+            r"all 21 joints .* in samples \[1\] the rays to joints \[4, 8\] meet behind",
+        ),
+        ("release", [], None, _EMPTY.format("the triangulated hand")),
+        ("v1", [4, 8], None, _EMPTY.format("the hand's root joint")),
+        ("v1", [], [[0, 0, 0]] * 2, _EMPTY.format("the hand's root joint")),
+        (
+            "v1-1stage",
+            [],
+            None,
+            _EMPTY.format(r"`first_stage.origin` = \(0.0, 0.0, 0.6\), metres before the pri.*"),
+        ),
+    ],
+)
+def test_the_cause_of_no_answer_is_named(name, unsolved, root, message, scene, monkeypatch):
+    """Of a sample whose rays to the root meet; where the root is given, there may be one ray."""
+    monkeypatch.setattr(apply_checks, "_rays_meet", lambda cams, uv_px: np.ones(2, bool))
+    views, cams = scene
+    root = None if root is None else np.array(root, np.float32)
+    if root is not None:
+        cams = _masked(cams, [[1, 1, 1, 1], [1, 0, 0, 0]])
+    uv_px, _ = project(cams.K, cams.T_cam_from_world, np.zeros((1, 1, NUM_JOINTS, 3)))
+    mask = np.ones((2, NUM_JOINTS), bool)
+    mask[1, unsolved] = False
+    found = Prediction(None, None, None, uv_px, None, np.array([True, False]), reference_joints_mask=mask)
+    with pytest.raises(ValueError, match=message):
+        apply_checks.check_solved(found, enter_working_frame(views, cams, root, np.float32), CONFIGS[name])
 
 
 def test_known_root_is_used_where_the_system_has_one(make_scene):
