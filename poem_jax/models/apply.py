@@ -171,16 +171,18 @@ def _check_grid_points(
             "depth), with padded views counted"
         )
     held = ball_index >= 0
-    if not held.any(-1).all():
+    empty = np.asarray(~held.any(-1))
+    if empty.any():
         raise ValueError(
-            f"`ball_index` must name at least one grid point; in samples {_where(~held.any(-1))} all are -1"
+            f"`ball_index` must name at least one grid point; in samples {_where(empty)} all are -1"
         )
     view = np.maximum(ball_index, 0) // draw.points_per_view
     lost = held & ~np.take_along_axis(view_mask, view, 1)
     if lost.any():
+        samples = np.asarray(lost.any(-1))
         raise ValueError(
             "`ball_index` must name points of valid views, since masked ones have no grids; samples "
-            f"{_where(lost.any(-1))} name points of the masked views {sorted(set(view[lost].tolist()))}. "
+            f"{_where(samples)} name points of the masked views {sorted(set(view[lost].tolist()))}. "
             "Number the points with masked views counted, or draw them with `key`"
         )
 
@@ -332,8 +334,9 @@ def _check_joints(prediction: Prediction, lost: Bool[np.ndarray, " batch"]) -> N
     assert prediction.reference_joints_mask is not None
     missing = lost[:, None] & ~np.asarray(prediction.reference_joints_mask)
     if missing.any():
+        samples = np.asarray(missing.any(-1))
         raise ValueError(
-            f"this model needs all {NUM_JOINTS} joints triangulated; in samples {_where(missing.any(-1))} "
+            f"this model needs all {NUM_JOINTS} joints triangulated; in samples {_where(samples)} "
             f"the rays to joints {np.flatnonzero(missing.any(0)).tolist()} meet behind a camera, or nowhere. "
             "Give views that see the whole hand"
         )

@@ -5,6 +5,7 @@ All 21 joints are triangulated and initialise the vertices (paper, "Output of th
 of one stage learns where to begin instead.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from flax import nnx
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, NUM_VERTICES, ROOT_JOINT, WRIST, join_queries
 from poem_jax.models.config import RootConfig
-from poem_jax.models.frustum import denormalised, normalised
+from poem_jax.models.frustum import denormalised, normalised, sigmoid_step
 from poem_jax.models.frustum_config import Cuboid
 from poem_jax.models.heat_maps import root_point, triangulate_joints
 from poem_jax.models.layers import linear, uniform
@@ -156,6 +157,10 @@ class LearnedStart(nnx.Module):
 # Coordinates in which the second stage works.
 
 
+Move = Callable[[Float[Array, "batch query 3"], Float[Array, "batch query 3"]], Float[Array, "batch query 3"]]
+"""From points and offsets to the moved points."""
+
+
 class AboutRoot(NamedTuple):
     """Coordinates about the root, in units of the ball's radius."""
 
@@ -170,9 +175,15 @@ class AboutRoot(NamedTuple):
         """To metres."""
         return points * self.radius + self.root[:, None]
 
+    def move(
+        self, points: Float[Array, "batch point 3"], offset: Float[Array, "batch point 3"]
+    ) -> Float[Array, "batch point 3"]:
+        """X + FFN(E)."""
+        return points + offset
+
 
 class InCuboid(NamedTuple):
-    """Coordinates that are shares of a cuboid."""
+    """Coordinates that are shares of a cuboid, which no point leaves."""
 
     cuboid: Cuboid
 
@@ -183,6 +194,12 @@ class InCuboid(NamedTuple):
     def leave(self, points: Float[Array, "batch point 3"]) -> Float[Array, "batch point 3"]:
         """To metres."""
         return denormalised(points, self.cuboid)
+
+    def move(
+        self, points: Float[Array, "batch point 3"], offset: Float[Array, "batch point 3"]
+    ) -> Float[Array, "batch point 3"]:
+        """Add the offset to the logits of the shares."""
+        return sigmoid_step(points, offset)
 
 
 def space_of(config: PoemV1Config, root: Float[Array, "batch 3"] | None) -> AboutRoot | InCuboid:
