@@ -15,12 +15,23 @@ Paper: "Misc. Modifications on the POEM Model" (what v1 has in place of v2's par
     w/o-pt      `PaperTokens`: PE-MeshTR's fusion and decoder, queries about the root
     G-emb ...   `GlobalEmbedding`, `GlobalAndVertexEmbedding`
 
-Where the paper says nothing, decided here for its models: grid points lie on rays through the cells' centres;
-a ball that holds fewer points than are wanted is filled up with copies, which no search for neighbours finds
-unless it holds fewer than k; sines of the projected point are added to its
-samples, and layers are post-norm, as in v2; the linear map starts as the joints' mean; w/o-proj enlarges the
-C / D channels of a point by one linear layer; G is the mean over the views of a linear map of the pooled last
-feature, and G-emb is brought to d channels by another.
+Where the paper says nothing, decided here for its models:
+
+- as in v2: the DLT's rows have unit norm, coordinates count in radii of the ball, sines of the projected
+  point are added to its samples, layers are post-norm, attentions have 4 heads, a layer's network goes
+  d -> 4 d -> 3;
+- linear maps begin by Xavier, as the paper says, but those to a layer's offsets at zero, and that to the
+  vertices as the joints' mean: learning starts from what was triangulated;
+- a known root replaces joint 9 for the ball and the coordinates; joints that were triangulated start where
+  they were, the others at the root;
+- grid points lie on rays through the cells' centres; a ball that holds fewer points than are wanted is filled
+  up with copies, which no search for neighbours finds unless it holds fewer than k;
+- 1stage: points move as logits of their shares, as PE-MeshTR's, for they are regressed "within these
+  predefined boundaries";
+- w/o-proj: one linear layer enlarges the C / D channels of a point;
+- w/o-pt: queries start as v1's do, and v1's embeddings are DETR's codes; one network of three layers makes
+  offsets from there of every layer's embeddings;
+- G is the mean over the views of a linear map of the pooled last feature; another brings G-emb to d channels.
 """
 
 from typing import NamedTuple

@@ -12,7 +12,9 @@
     too few points   copies, which no search finds           points at the primary camera's centre
     queries          [V, J]                                  [J, V]
 
-It has no layer norm, no feed-forward network and no dropout.
+It has no layer norm, no feed-forward network and no dropout. Left out of the release: its error where more
+than half of the projections' coordinates are outside the images, and the zeros that it puts in place of NaN.
+Here linear maps begin by Xavier and offsets at zero, there by PyTorch's default.
 """
 
 from typing import NamedTuple
