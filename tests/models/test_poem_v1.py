@@ -275,7 +275,7 @@ def test_one_stage_stays_in_its_cuboid():
     """`test_poem_v1_equations.py` has the decoder move points by its space."""
     space = space_of(CONFIGS["v1-1stage"], None)
     shares = jnp.array([[[0.1, 0.5, 0.9]]] * 3)
-    points = space.leave(space.move(shares, jnp.array([-9.0, 0.0, 9.0])[:, None, None]))
+    points = space.leave(space.move(shares, jnp.array([[[-9.0] * 3], [[0.0] * 3], [[9.0] * 3]])))
     np.testing.assert_allclose(points[1, 0], [-0.4, 0.0, 0.92], atol=1e-5)
     assert (points > jnp.array(CUBOID.low)).all()
     assert (points < jnp.array(CUBOID.high)).all()
@@ -367,15 +367,17 @@ def test_known_root_is_used_where_the_system_has_one(make_scene):
     ]
 
 
-def test_one_program_for_all_masks(make_scene):
-    views, cams = make_scene(2, 4)
-    masks = ([[1, 1, 0, 1], [0, 1, 1, 0]], [[0, 0, 1, 1], [1, 1, 1, 1]])
-    for config in (V1, RELEASE):
-        predict(config, views, _masked(cams, np.ones((2, 4))))
-        programs = model_of(config).run._cache_size()
-        for mask in masks:
-            predict(config, views, _masked(cams, mask))
-        assert model_of(config).run._cache_size() == programs
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[] if name == "v1" else pytest.mark.slow) for name in CONFIGS],
+)
+def test_one_program_for_1_to_8_views(name, make_scene):
+    views, cams = make_scene(1, 8)
+    run = model_of(CONFIGS[name]).run
+    programs = run._cache_size()
+    for count in range(1, 9):
+        predict(CONFIGS[name], views, _masked(cams, [[i < count for i in range(8)]]))
+    assert run._cache_size() == programs + 1
 
 
 @pytest.mark.slow
