@@ -51,6 +51,9 @@ class Prediction(NamedTuple):
     """Where each view sees the joints of `keypoints_px`; every map sums to 1."""
     reference_joints_world: Float[Array, "batch 21 3"] | None = None
     """All triangulated joints, where the model has 21 heat maps."""
+    reference_joints_mask: Bool[Array, "batch 21"] | None = None
+    """False where a joint could not be triangulated: its rays do not meet before all cameras that see it.
+    None, too, where the model has no such joints."""
     pose: Float[Array, "batch 16 3"] | None = None
     """Axis-angle of parametric models, `pose[:, 0]` in the user's world; compare as rotations."""
     shape: Float[Array, "batch 10"] | None = None

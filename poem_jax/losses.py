@@ -2,7 +2,9 @@
 
 All points are metres, all pixels belong to the crops as fed, and D is the diagonal of a crop in pixels.
 Every mean runs over what exists: padded views (`view_mask`), padded samples (`sample_mask`) and samples that
-could not be solved (`Prediction.valid`) change neither a loss nor a gradient.
+could not be solved (`Prediction.valid`) change neither a loss nor a gradient. The terms of the first stage,
+key points and triangulated joints, do not ask whether the second was solved; joints that could not be
+triangulated (`Prediction.reference_joints_mask`) are left out.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +25,7 @@ from poem_jax.geometry.transforms import (
     rotation_from_axis_angle,
 )
 from poem_jax.hand.model import HandModel, joints_from_vertices
-from poem_jax.hand.topology import ROOT_JOINT, QueryOrder, split_queries
+from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT, QueryOrder, split_queries
 from poem_jax.typing import Array, Bool, Float
 
 
@@ -63,7 +65,7 @@ class LossRecipe:
     heat_map_sigma: float = 0.75
     """Spread of that Gaussian, in cells."""
     triangulation: float = 0.0
-    """All 21 triangulated joints of the first stage, squared errors in square metres."""
+    """The triangulated joints of the first stage, squared errors in square metres."""
     joints: float = 1.0
     regressed_joints: float = 1.0
     """Joints regressed from the vertices."""
@@ -192,9 +194,9 @@ def multi_view_losses(
 
     first_stage = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=recipe, axis_name=axis_name)
     if recipe.triangulation:
-        reference = _present(prediction.reference_joints_world, "triangulation", recipe)
-        residual = reference - truth.joints
-        first_stage["triangulation"] = masked_mean(residual**2, sample_mask, axis_name=axis_name)
+        first_stage["triangulation"] = triangulation_term(
+            prediction, batch, recipe=recipe, axis_name=axis_name
+        )
 
     compare = partial(
         _point_terms,
@@ -246,6 +248,21 @@ def keypoint_terms(
         entropy = _cross_entropy(prediction.heat_maps, cells, recipe.heat_map_sigma)
         terms["heat_maps"] = masked_mean(entropy, view_mask, axis_name=axis_name)
     return terms
+
+
+def triangulation_term(
+    prediction: Prediction, batch: MultiViewBatch, *, recipe: LossRecipe, axis_name: str | None = None
+) -> Float[Array, ""]:
+    """Compute the mean squared error of the joints that could be triangulated, also in samples whose second
+    stage does not count, since this loss is what brings those back.
+
+    Arguments, masks and errors as in `multi_view_losses`.
+    """
+    joints = _present(prediction.reference_joints_world, "triangulation", recipe)
+    solved = prediction.reference_joints_mask
+    exists = jnp.any(valid_masks(prediction, batch)[0], -1)
+    counted = exists[:, None] & (jnp.ones(NUM_JOINTS, bool) if solved is None else solved)
+    return masked_mean((joints - batch.joints_world) ** 2, counted, axis_name=axis_name)
 
 
 def _present(value: Array | None, weight: str, recipe: LossRecipe) -> Array:

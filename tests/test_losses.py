@@ -18,11 +18,13 @@ from poem_jax.losses import (
     RECIPES,
     RELEASE,
     SYNTHETIC,
+    V1,
     Layers,
     LossRecipe,
     Penalty,
     masked_mean,
     multi_view_losses,
+    triangulation_term,
 )
 
 HW = (128, 96)
@@ -262,6 +264,24 @@ def test_unsolved_samples_do_not_count_in_3d(hand):
         multi_view_losses(first, alone, **options)[0],
         rtol=1e-6,
     )
+
+
+def test_triangulated_joints_count_where_their_rays_met():
+    """Also in samples whose second stage does not count, for it is this loss that brings those back."""
+    prediction, batch = random_case()
+    mask = np.ones((2, 21), bool)
+    mask[0, [3, 9]] = False
+
+    def term(**changed):
+        case = prediction._replace(reference_joints_mask=mask, **changed)
+        return triangulation_term(case, batch, recipe=V1)
+
+    squares = (prediction.reference_joints_world - batch.joints_world) ** 2
+    astray = np.where(mask[..., None], prediction.reference_joints_world, 7.0).astype(np.float32)
+    for changed in ({}, {"valid": np.zeros(2, bool)}, {"reference_joints_world": astray}):
+        np.testing.assert_allclose(term(**changed), squares[mask].mean(), rtol=1e-6)
+    batch = batch._replace(sample_mask=np.array([True, False]))
+    np.testing.assert_allclose(term(), squares[0][mask[0]].mean(), rtol=1e-6)
 
 
 def test_masked_mean_is_defined_without_entries():

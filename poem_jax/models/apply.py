@@ -70,7 +70,7 @@ def apply(
             `takes_root`.
         ball_index: for systems that draw basis points from the grids before the cameras
             (`config.grid_draw`): which points each sample reads, as numbers in its grid (view, w, h, depth),
-            flattened. None = drawn with `key`.
+            flattened; -1 where the ball held no more. None = drawn with `key`.
         key: for the same systems, one JAX key; None = key 0. Unused where `ball_index` is given.
 
     Returns: the prediction in the world frame of `cams`; what the system does not have is None there. Under a
@@ -107,7 +107,7 @@ def check_inputs(
     _check_views(views, config)
     network.check_view_count(config, views.shape[1])
     if ball_index is not None and config.grid_draw is not None:
-        _check_ball_index(ball_index, len(views), views.shape[1], config.grid_draw)
+        _check_ball_index(ball_index, len(views), config.grid_draw)
     if np.shape(cams.K) != (*views.shape[:2], 3, 3):
         raise ValueError(
             f"`cams.K` must have shape (batch, view, 3, 3) = {(*views.shape[:2], 3, 3)}, as `views` says; "
@@ -117,6 +117,8 @@ def check_inputs(
     if root_world is not None and not traced:
         _check_root(np.asarray(root_world))
     check_cameras(cams, config.image_hw, root_world)
+    if ball_index is not None and config.grid_draw is not None and not is_traced(ball_index, cams.view_mask):
+        _check_grid_points(np.asarray(ball_index), np.asarray(cams.view_mask), config.grid_draw)
     if not traced:
         _check_view_counts(cams, root_world, config)
         _check_float_images(views, np.asarray(cams.view_mask))
@@ -147,20 +149,41 @@ def _is_one_key(key: Any) -> bool:
     return key.shape == () if typed else key.dtype == np.uint32 and key.ndim == 1
 
 
-def _check_ball_index(ball_index: Any, batch: int, num_views: int, draw: GridDraw) -> None:
-    shape, wanted, size = np.shape(ball_index), (batch, draw.num_points), num_views * draw.points_per_view
+def _check_ball_index(ball_index: Any, batch: int, draw: GridDraw) -> None:
+    shape, wanted = np.shape(ball_index), (batch, draw.num_points)
     if not isinstance(ball_index, np.ndarray | jax.Array) or not np.issubdtype(ball_index.dtype, np.integer):
         kind = getattr(ball_index, "dtype", type(ball_index).__name__)
         raise ValueError(f"`ball_index` must be an array of whole numbers; got {kind}. Convert it to int32")
     if shape != wanted:
         raise ValueError(f"`ball_index` must have shape (batch, point) = {wanted}; got {shape}")
-    if is_traced(ball_index):
-        return
-    low, high = int(np.min(ball_index)), int(np.max(ball_index))
-    if low < 0 or high >= size:
+
+
+def _check_grid_points(
+    ball_index: Int[np.ndarray, "batch point"], view_mask: Bool[np.ndarray, "batch view"], draw: GridDraw
+) -> None:
+    """Raise unless every sample has basis points, all of them of valid views."""
+    num_views, (low, high) = view_mask.shape[1], (int(ball_index.min()), int(ball_index.max()))
+    size = num_views * draw.points_per_view
+    if low < -1 or high >= size:
         raise ValueError(
-            f"`ball_index` must number the {size} grid points of {num_views} views, 0 to {size - 1}; got "
-            f"{low} to {high}. Number them in the order (view, w, h, depth), with padded views counted"
+            f"`ball_index` must number the {size} grid points of {num_views} views, 0 to {size - 1}, with -1 "
+            f"where the ball held no more; got {low} to {high}. Number them in the order (view, w, h, "
+            "depth), with padded views counted"
+        )
+    held = ball_index >= 0
+    empty = np.asarray(~held.any(-1))
+    if empty.any():
+        raise ValueError(
+            f"`ball_index` must name at least one grid point; in samples {_where(empty)} all are -1"
+        )
+    view = np.maximum(ball_index, 0) // draw.points_per_view
+    lost = held & ~np.take_along_axis(view_mask, view, 1)
+    if lost.any():
+        samples = np.asarray(lost.any(-1))
+        raise ValueError(
+            "`ball_index` must name points of valid views, since masked ones have no grids; samples "
+            f"{_where(samples)} name points of the masked views {sorted(set(view[lost].tolist()))}. "
+            "Number the points with masked views counted, or draw them with `key`"
         )
 
 
@@ -265,12 +288,15 @@ def check_solved(prediction: Prediction, frame: WorkingFrame, config: ModelConfi
         return
     lost = ~np.asarray(prediction.valid)
     if config.triangulates:
-        _check_rays(prediction, frame, config, lost)
+        # A root that was given is not sought with rays.
+        _check_rays(prediction, frame, config, lost & ~np.isfinite(frame.known_root).all(-1))
+    if config.needs_all_joints:
+        _check_joints(prediction, lost)
     if config.grid_draw is not None:
         raise ValueError(
-            f"points of the cameras' grids must lie in the ball about the hand; in samples {_where(lost)} "
-            "none does. Check that all views see the hand, at distances that the grids reach, and that "
-            "`T_cam_from_world` is in metres"
+            f"points of the cameras' grids must lie in the ball about {config.grid_draw.about}; in samples "
+            f"{_where(lost)} none does. Check that the cameras look there, at distances that their grids "
+            "reach, and that `T_cam_from_world` is in metres"
         )
     raise ValueError(f"samples {_where(lost)} have no answer: their views determine none")
 
@@ -278,7 +304,9 @@ def check_solved(prediction: Prediction, frame: WorkingFrame, config: ModelConfi
 def _check_rays(
     prediction: Prediction, frame: WorkingFrame, config: ModelConfig, lost: Bool[np.ndarray, " batch"]
 ) -> None:
-    """Raise unless the rays of all lost samples meet before their cameras."""
+    """Raise unless the rays to the root meet before their cameras in all samples of `lost`."""
+    if not lost.any():
+        return
     assert prediction.keypoints_px is not None
     root_or = "`root_world`, or " if config.takes_root else ""
     joint = ROOT_JOINT if prediction.keypoints_px.shape[2] == NUM_JOINTS else 0
@@ -299,6 +327,19 @@ def _check_rays(
         "camera, or nowhere. Check that images and cameras are in the same order and that "
         f"`T_cam_from_world` maps world to camera{', or give `root_world`' if config.takes_root else ''}"
     )
+
+
+def _check_joints(prediction: Prediction, lost: Bool[np.ndarray, " batch"]) -> None:
+    """Raise where other joints than the root could not be triangulated."""
+    assert prediction.reference_joints_mask is not None
+    missing = lost[:, None] & ~np.asarray(prediction.reference_joints_mask)
+    if missing.any():
+        samples = np.asarray(missing.any(-1))
+        raise ValueError(
+            f"this model needs all {NUM_JOINTS} joints triangulated; in samples {_where(samples)} "
+            f"the rays to joints {np.flatnonzero(missing.any(0)).tolist()} meet behind a camera, or nowhere. "
+            "Give views that see the whole hand"
+        )
 
 
 def _rays_meet(cams: Cameras, uv_px: Float[np.ndarray, "batch view 2"]) -> Bool[np.ndarray, " batch"]:

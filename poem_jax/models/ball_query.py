@@ -61,15 +61,11 @@ def in_ball(
     return square < config.radius**2
 
 
-def repeated(index: Int[Array, "batch basis"]) -> Int[Array, "batch basis"]:
-    """Fill the places of what the ball does not hold by repeating what it holds, all alike (PointNet++
-    repeats the first); by grid point 0 if it holds nothing.
-
-    `index`: what the ball holds, then -1.
-    """
-    found = jnp.sum(index >= 0, -1, keepdims=True)
-    again = jnp.arange(index.shape[-1]) % jnp.maximum(found, 1)
-    return jnp.maximum(jnp.take_along_axis(index, again, -1), 0)
+def filled(index: Int[Array, "batch basis"]) -> Int[Array, "batch basis"]:
+    """Put the first point that the ball holds in the place of every -1, as PointNet++ does; grid point 0 if
+    it holds nothing. Who searches for neighbours leaves these copies out."""
+    first = jnp.take_along_axis(index, jnp.argmax(index >= 0, -1, keepdims=True), -1)
+    return jnp.maximum(jnp.where(index >= 0, index, first), 0)
 
 
 def points_at(

@@ -377,6 +377,8 @@ class GridDraw(NamedTuple):
     """How many are drawn."""
     points_per_view: int
     """Grid points of one camera."""
+    about: str = "the hand"
+    """What the ball lies about, in words, for messages."""
 
 
 class ModelConfig:
@@ -404,6 +406,11 @@ class ModelConfig:
     @property
     def takes_root(self) -> bool:
         """Whether `root_world` may be given; it then stands in for the triangulated root."""
+        return False
+
+    @property
+    def needs_all_joints(self) -> bool:
+        """Whether all 21 joints must be triangulated, not the root alone."""
         return False
 
     @property

@@ -15,11 +15,23 @@ Paper: "Misc. Modifications on the POEM Model" (what v1 has in place of v2's par
     w/o-pt      `PaperTokens`: PE-MeshTR's fusion and decoder, queries about the root
     G-emb ...   `GlobalEmbedding`, `GlobalAndVertexEmbedding`
 
-Where the paper says nothing, decided here for its models: grid points lie on rays through the cells' centres;
-a ball that holds fewer points than are wanted repeats them; sines of the projected point are added to its
-samples, and layers are post-norm, as in v2; the linear map starts as the joints' mean; w/o-proj enlarges the
-C / D channels of a point by one linear layer; G is the mean over the views of a linear map of the pooled last
-feature, and G-emb is brought to d channels by another.
+Where the paper says nothing, decided here for its models:
+
+- as in v2: the DLT's rows have unit norm, coordinates count in radii of the ball, sines of the projected
+  point are added to its samples, layers are post-norm, attentions have 4 heads, a layer's network goes
+  d -> 4 d -> 3;
+- linear maps begin by Xavier, as the paper says, but those to a layer's offsets at zero, and that to the
+  vertices as the joints' mean: learning starts from what was triangulated;
+- a known root replaces joint 9 for the ball and the coordinates; joints that were triangulated start where
+  they were, the others at the root;
+- grid points lie on rays through the cells' centres; a ball that holds fewer points than are wanted is filled
+  up with copies, which no search for neighbours finds unless it holds fewer than k;
+- 1stage: points move as logits of their shares, as PE-MeshTR's, for they are regressed "within these
+  predefined boundaries";
+- w/o-proj: one linear layer enlarges the C / D channels of a point;
+- w/o-pt: queries start as v1's do, and v1's embeddings are DETR's codes; one network of three layers makes
+  offsets from there of every layer's embeddings;
+- G is the mean over the views of a linear map of the pooled last feature; another brings G-emb to d channels.
 """
 
 from typing import NamedTuple
@@ -34,7 +46,7 @@ from poem_jax.hand.model import HandModel, template_queries
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models.aggregation import ProjectiveAggregation
 from poem_jax.models.backbones import ResNet
-from poem_jax.models.ball_query import draw_ball, points_at, repeated
+from poem_jax.models.ball_query import draw_ball, filled, points_at
 from poem_jax.models.config import AggregationConfig, Design, RootConfig
 from poem_jax.models.decoder import PAPER_EPSILON, MultiHeadAttention, OffsetNetwork
 from poem_jax.models.detr import DetrDecoder
@@ -49,7 +61,6 @@ from poem_jax.models.layers import (
     normal,
     trunk_images,
 )
-from poem_jax.models.mesh_transformer_config import MeshTransformerConfig, PositionEmbeddedFusion
 from poem_jax.models.mesh_transformers import EmbeddedPositions, ReadOutNetwork
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.poem_v1_config import (
@@ -62,6 +73,7 @@ from poem_jax.models.poem_v1_config import (
 from poem_jax.models.poem_v1_release import ReleaseFeatures, ReleasePoints, own_channels
 from poem_jax.models.poem_v1_start import (
     LearnedStart,
+    Move,
     ReleaseStart,
     Scene,
     Start,
@@ -128,8 +140,8 @@ class PoemV1(nnx.Module):
             mode: whether this is training.
             dropout_key: for what is dropped in training, by PE-MeshTR's decoder alone.
             ball_index: numbers of the basis points in each sample's grid (view, w, h, depth), flattened; -1
-                stands for a point at the primary camera's centre in the release, and for a repeated one in
-                the paper's design. None = drawn.
+                stands for a point at the primary camera's centre in the release, and for none in the paper's
+                design. None = drawn.
             key: what they are drawn with; None = key 0.
 
         Returns: the prediction. A sample is not valid where its root cannot be found (release: any joint), or
@@ -150,6 +162,7 @@ class PoemV1(nnx.Module):
             start.valid & basis.found & jnp.any(cams.view_mask, -1),
             jnp.stack(layers, 1),
             parameters=None,
+            reference_mask=start.solved,
         )
         return leave_working_frame(found, frame, self.hand.model(), self.config.query_order)
 
@@ -199,13 +212,15 @@ class PaperPoints(nnx.Module):
     def __call__(self, scene: Scene) -> list[Float[Array, "batch query 3"]]:
         """Return the query points after every layer, metres in the primary camera's frame."""
         assert scene.index is not None
-        index, space = repeated(scene.index), space_of(self.config, scene.start.root)
+        held, index = scene.index >= 0, filled(scene.index)
+        space = space_of(self.config, scene.start.root)
         basis = points_at(scene.grid, index)
         features = self.basis(scene.feature_maps, scene.cams, basis, index)
         embeddings = self.embedding(scene.pooled, scene.cams.view_mask)
         embeddings = jnp.broadcast_to(embeddings, (len(features), *embeddings.shape[1:]))
         queries, points = space.enter(scene.start.queries), space.enter(basis)
-        return [space.leave(moved) for moved in self.decoder(embeddings, queries, features, points)]
+        moved = self.decoder(embeddings, queries, features, points, held, space.move)
+        return [space.leave(layer) for layer in moved]
 
 
 class ProjectedFeatures(nnx.Module):
@@ -245,7 +260,9 @@ class OwnCameraFeatures(nnx.Module):
         index: Int[Array, "batch basis"],
     ) -> Float[Array, "batch basis c"]:
         """Return the features of the basis points."""
-        return self.enlarge(own_channels(maps, self.depths, index))
+        batch, view, h, w, c = maps.shape
+        by_point = maps.reshape(batch, view, h, w, self.depths, c // self.depths)
+        return self.enlarge(own_channels(by_point, index))
 
 
 _BASIS = {BasisFeatures.PROJECTED: ProjectedFeatures, BasisFeatures.OWN_CAMERA: OwnCameraFeatures}
@@ -324,7 +341,7 @@ class PaperTokens(nnx.Module):
     def __init__(self, config: PoemV1Config, hand: HandModel, *, rngs: nnx.Rngs) -> None:
         assert isinstance(config.decoder, TokenDecoderConfig)
         self.config = config
-        self.fusion = EmbeddedPositions(_as_mesh_transformer(config, config.decoder), rngs=rngs)
+        self.fusion = EmbeddedPositions(config.as_mesh_transformer(config.decoder), rngs=rngs)
         self.embedding = _EMBEDDINGS[config.query_embedding](config, hand, rngs=rngs)
         self.decoder = DetrDecoder(config.decoder.detr, config.width, rngs=rngs)
         self.offsets = ReadOutNetwork(config.width, rngs=rngs)
@@ -336,21 +353,8 @@ class PaperTokens(nnx.Module):
         codes = jnp.broadcast_to(codes, (len(scene.pooled), *codes.shape[1:]))
         embeddings = self.decoder(codes, tokens.values, tokens.codes, tokens.mask, scene.dropout_key)
         space = space_of(self.config, scene.start.root)
-        moved = space.enter(scene.start.queries)[:, None] + self.offsets(embeddings)
-        return [space.leave(moved[:, i]) for i in range(moved.shape[1])]
-
-
-def _as_mesh_transformer(config: PoemV1Config, decoder: TokenDecoderConfig) -> MeshTransformerConfig:
-    """Return PE-MeshTR with the sizes of a POEM v1."""
-    return MeshTransformerConfig(
-        fusion=PositionEmbeddedFusion(config.basis.frustum),
-        image_hw=config.image_hw,
-        width=config.width,
-        backbone=config.backbone,
-        stride=config.stride,
-        cuboid=decoder.cuboid,
-        decoder=decoder.detr,
-    )
+        offsets, queries = self.offsets(embeddings), space.enter(scene.start.queries)
+        return [space.leave(space.move(queries, offsets[:, i])) for i in range(offsets.shape[1])]
 
 
 class PaperDecoder(nnx.Module):
@@ -366,19 +370,31 @@ class PaperDecoder(nnx.Module):
         queries: Float[Array, "batch query 3"],
         features: Float[Array, "batch basis c"],
         points: Float[Array, "batch basis 3"],
+        point_mask: Bool[Array, "batch basis"],
+        move: Move,
     ) -> list[Float[Array, "batch query 3"]]:
-        """Return the query points after every layer, in the coordinates of `queries` and `points`."""
+        """Return the query points after every layer, in the coordinates of `queries` and `points`.
+
+        Args:
+            embeddings: of the queries.
+            queries: where they start.
+            features: of the basis points.
+            points: where these stand.
+            point_mask: False = a copy, which is read only where fewer than k points are none.
+            move: how points move by an offset in these coordinates.
+        """
         moved = []
         for layer in self.layers:
-            near = nearest_neighbours(queries, points, self.num_neighbours)
-            embeddings, queries = layer(embeddings, queries, features, near)
+            near = nearest_neighbours(queries, points, self.num_neighbours, point_mask)
+            embeddings, offset = layer(embeddings, queries, features, near)
+            queries = move(queries, offset)
             moved.append(queries)
         return moved
 
 
 class PaperLayer(nnx.Module):
     """v2's layer without the cross-attention: queries read each other and their nearest basis points; then
-    they move."""
+    the feed-forward network says how they move."""
 
     def __init__(self, config: PointDecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.self_attention = MultiHeadAttention(width, config.num_heads, rngs=rngs)
@@ -393,8 +409,8 @@ class PaperLayer(nnx.Module):
         features: Float[Array, "batch basis c"],
         near: Neighbours,
     ) -> tuple[Float[Array, "batch query c"], Float[Array, "batch query 3"]]:
-        """Return the updated embeddings and points."""
+        """Return the updated embeddings, and offsets of the points."""
         after_queries, after_nearest = self.norms
         e = after_queries(embeddings + self.self_attention(embeddings, embeddings))
         e = after_nearest(e + self.vector_attention(e, queries, features, near))
-        return e, queries + self.feed_forward(e)
+        return e, self.feed_forward(e)

@@ -1,12 +1,13 @@
 """Configuration of POEM v1 (the paper's conference model) and of its ablations.
 
 `design` says whether feature maps, basis features, query embeddings and decoder are the paper's or the
-release's; the fields beside it are what the ablations vary.
+release's; the fields beside it are what the ablations vary. The paper's models have the depths and the cuboid
+of DexYCB, the only ones that it names; `in_cuboid` gives the same model those of another data set.
 """
 
 import enum
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, QueryOrder
 from poem_jax.models.config import (
@@ -23,6 +24,7 @@ from poem_jax.models.config import (
 )
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import DEXYCB_CUBOID, Cuboid, DepthSteps, FrustumConfig
+from poem_jax.models.mesh_transformer_config import MeshTransformerConfig, PositionEmbeddedFusion
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class OneStageConfig:
     "Two-stage Design", POEM v1-1stage)."""
 
     origin: tuple[float, float, float] = (0.0, 0.0, 0.8)
-    """Mean root joint of the training set in the primary camera's frame, metres."""
+    """Mean root joint of the training set in the primary camera's frame, metres
+    (`training.mean_root.mean_root`); what stands here is a guess."""
 
     def __post_init__(self) -> None:
         require(
@@ -215,7 +218,14 @@ class PoemV1Config(ModelConfig):
             f"`width` must be a multiple of the {depths} depths, each of which has its share of a cell's "
             f"channels; got {self.width}",
         )
-        if isinstance(decoder, PointDecoderConfig):
+        if isinstance(decoder, TokenDecoderConfig):
+            require(
+                not own_camera,
+                "`basis_features` must be projected where `decoder` reads tokens, since there are no basis "
+                f"points; got {self.basis_features}",
+            )
+            self.as_mesh_transformer(decoder)
+        else:
             require(
                 decoder.num_neighbours <= self.basis.num_points <= self._points_per_view,
                 f"`basis.num_points` must be from `num_neighbours` = {decoder.num_neighbours} to the "
@@ -247,6 +257,22 @@ class PoemV1Config(ModelConfig):
         """Cells of the feature map."""
         return self.image_hw[0] // self.stride, self.image_hw[1] // self.stride
 
+    def as_mesh_transformer(self, decoder: TokenDecoderConfig) -> MeshTransformerConfig:
+        """Return the PE-MeshTR whose fusion and decoder these are.
+
+        Raises:
+            ValueError: sizes that it cannot have.
+        """
+        return MeshTransformerConfig(
+            fusion=PositionEmbeddedFusion(self.basis.frustum),
+            image_hw=self.image_hw,
+            width=self.width,
+            backbone=self.backbone,
+            stride=self.stride,
+            cuboid=decoder.cuboid,
+            decoder=decoder.detr,
+        )
+
     @property
     def _points_per_view(self) -> int:
         return self.map_hw[0] * self.map_hw[1] * self.basis.frustum.num_depths
@@ -262,11 +288,20 @@ class PoemV1Config(ModelConfig):
         return self.triangulates and self.design is Design.PAPER
 
     @property
+    def needs_all_joints(self) -> bool:
+        """The paper's model starts joints that it cannot triangulate at the root; the release does not."""
+        return self.triangulates and self.design is Design.RELEASE
+
+    @property
     def grid_draw(self) -> GridDraw | None:
         """How basis points are drawn from the cameras' grids; None = PE-MeshTR's decoder needs none."""
         if not isinstance(self.decoder, PointDecoderConfig):
             return None
-        return GridDraw(self.basis.num_points, self._points_per_view)
+        if isinstance(self.first_stage, OneStageConfig):
+            about = f"`first_stage.origin` = {self.first_stage.origin}, metres before the primary camera"
+        else:
+            about = "the hand's root joint" if self.takes_root else "the triangulated hand"
+        return GridDraw(self.basis.num_points, self._points_per_view, about)
 
 
 V1 = PoemV1Config()
@@ -276,7 +311,20 @@ V1 = PoemV1Config()
 def one_stage(origin: tuple[float, float, float], cuboid: Cuboid = DEXYCB_CUBOID) -> PoemV1Config:
     """Return the ablation without a first stage; `origin` is the mean root of the training set, metres in
     the primary camera's frame."""
-    return PoemV1Config(first_stage=OneStageConfig(origin), space=cuboid)
+    return in_cuboid(PoemV1Config(first_stage=OneStageConfig(origin), space=cuboid), cuboid)
+
+
+def in_cuboid(config: PoemV1Config, cuboid: Cuboid) -> PoemV1Config:
+    """Return the same model for hands elsewhere, for example in `presets.CUBOIDS["ho3d"]`: the depths of its
+    grids are those of the cuboid, and so are the shares that its coordinates are, where they are any."""
+    frustum = replace(config.basis.frustum, start=cuboid.low[2], end=cuboid.high[2])
+    decoder = config.decoder
+    return replace(
+        config,
+        basis=replace(config.basis, frustum=frustum),
+        space=cuboid if isinstance(config.space, Cuboid) else config.space,
+        decoder=replace(decoder, cuboid=cuboid) if isinstance(decoder, TokenDecoderConfig) else decoder,
+    )
 
 
 def released(

@@ -8,9 +8,13 @@
     decoder          self-attention, vector attention        vector attention among the queries, then to the
                      to the basis, feed-forward network      basis; before, among the basis points
     coordinates      about the root, in ball radii           shares of a cuboid, moved as logits
+    w/o-proj         channels (depth, feature)               channels (feature, depth)
+    too few points   copies, which no search finds           points at the primary camera's centre
     queries          [V, J]                                  [J, V]
 
-It has no layer norm, no feed-forward network and no dropout.
+It has no layer norm, no feed-forward network and no dropout. Left out of the release: its error where more
+than half of the projections' coordinates are outside the images, and the zeros that it puts in place of NaN.
+Here linear maps begin by Xavier and offsets at zero, there by PyTorch's default.
 """
 
 from typing import NamedTuple
@@ -213,7 +217,7 @@ def projected_anyhow(
 
 class OwnCameraRelease(nnx.Module):
     """A basis point has the channels of its depth in its own camera's cell, enlarged by one layer; query
-    points read no image."""
+    points read no image. A cell's channels are (feature, depth)."""
 
     def __init__(self, config: PoemV1Config, *, rngs: nnx.Rngs) -> None:
         self.depths = config.basis.frustum.num_depths
@@ -228,19 +232,21 @@ class OwnCameraRelease(nnx.Module):
         index: Int[Array, "batch basis"],
     ) -> tuple[Float[Array, "batch basis c"], Float[Array, ""]]:
         """Return the features of basis points, and zero."""
-        return self.enlarge(own_channels(coded.maps, self.depths, index)), jnp.zeros((), coded.maps.dtype)
+        batch, view, h, w, c = coded.maps.shape
+        by_point = jnp.swapaxes(coded.maps.reshape(batch, view, h, w, c // self.depths, self.depths), -1, -2)
+        return self.enlarge(own_channels(by_point, index)), jnp.zeros((), coded.maps.dtype)
 
 
 def own_channels(
-    maps: Float[Array, "batch view h w c"], depths: int, index: Int[Array, "batch basis"]
-) -> Float[Array, "batch basis c2"]:
-    """Return the channels that belong to grid points: a cell's channels are (feature, depth).
+    by_point: Float[Array, "batch view h w depth c"], index: Int[Array, "batch basis"]
+) -> Float[Array, "batch basis c"]:
+    """Return the channels that belong to grid points.
 
-    `index`: numbers in the grid (view, w, h, depth), flattened; -1 reads zeros.
+    Args:
+        by_point: the channels of every cell, shared out among its depths.
+        index: numbers in the grid (view, w, h, depth), flattened; -1 reads zeros.
     """
-    batch, view, h, w, c = maps.shape
-    by_point = maps.reshape(batch, view, h, w, c // depths, depths).transpose(0, 1, 3, 2, 5, 4)
-    rows = by_point.reshape(batch, -1, c // depths)
+    rows = jnp.swapaxes(by_point, 2, 3).reshape(len(by_point), -1, by_point.shape[-1])
     taken = jax.vmap(lambda table, i: table[i])(rows, jnp.maximum(index, 0))
     return jnp.where((index >= 0)[..., None], taken, 0)
 

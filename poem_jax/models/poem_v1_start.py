@@ -5,6 +5,7 @@ All 21 joints are triangulated and initialise the vertices (paper, "Output of th
 of one stage learns where to begin instead.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from flax import nnx
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, NUM_VERTICES, ROOT_JOINT, WRIST, join_queries
 from poem_jax.models.config import RootConfig
-from poem_jax.models.frustum import denormalised, normalised
+from poem_jax.models.frustum import denormalised, normalised, sigmoid_step
 from poem_jax.models.frustum_config import Cuboid
 from poem_jax.models.heat_maps import root_point, triangulate_joints
 from poem_jax.models.layers import linear, uniform
@@ -47,7 +48,9 @@ class Start(NamedTuple):
     root: Float[Array, "batch 3"] | None
     """None where there is no first stage."""
     joints: Float[Array, "batch 21 3"] | None
-    """As triangulated; zero where they could not be."""
+    """As triangulated; what stands where they could not be means nothing."""
+    solved: Bool[Array, "batch 21"] | None
+    """Which could be."""
     valid: Bool[Array, " batch"]
 
 
@@ -101,7 +104,7 @@ class TriangulatedStart(nnx.Module):
         root, valid = root_point(joints, solved, frame.known_root, jnp.asarray(cams.view_mask))
         about_root = jnp.where(solved[..., None], joints - root[:, None], 0)
         queries = join_queries(self.mesh(about_root), about_root, self.order) + root[:, None]
-        return Start(queries, root, root, joints, valid)
+        return Start(queries, root, root, joints, solved, valid)
 
 
 class ReleaseStart(nnx.Module):
@@ -122,7 +125,8 @@ class ReleaseStart(nnx.Module):
         wrist = joints[:, WRIST, None]
         about_wrist = joints - wrist
         queries = join_queries(self.mesh(about_wrist), about_wrist, self.order) + wrist
-        return Start(queries, self._centre(queries), joints[:, ROOT_JOINT], joints, jnp.all(solved, -1))
+        root, centre = joints[:, ROOT_JOINT], self._centre(queries)
+        return Start(queries, centre, root, joints, solved, jnp.all(solved, -1))
 
     def _centre(self, queries: Float[Array, "batch query 3"]) -> Float[Array, "batch 3"]:
         by_axis = jnp.swapaxes(queries, 1, 2)
@@ -147,10 +151,14 @@ class LearnedStart(nnx.Module):
             jnp.broadcast_to(jnp.asarray(leaf, points.dtype), (batch, *np.shape(leaf)))
             for leaf in (points, np.array(self.origin))
         )
-        return Start(queries, centre, None, None, jnp.ones(batch, bool))
+        return Start(queries, centre, None, None, None, jnp.ones(batch, bool))
 
 
 # Coordinates in which the second stage works.
+
+
+Move = Callable[[Float[Array, "batch query 3"], Float[Array, "batch query 3"]], Float[Array, "batch query 3"]]
+"""From points and offsets to the moved points."""
 
 
 class AboutRoot(NamedTuple):
@@ -167,9 +175,15 @@ class AboutRoot(NamedTuple):
         """To metres."""
         return points * self.radius + self.root[:, None]
 
+    def move(
+        self, points: Float[Array, "batch point 3"], offset: Float[Array, "batch point 3"]
+    ) -> Float[Array, "batch point 3"]:
+        """X + FFN(E)."""
+        return points + offset
+
 
 class InCuboid(NamedTuple):
-    """Coordinates that are shares of a cuboid."""
+    """Coordinates that are shares of a cuboid, which no point leaves."""
 
     cuboid: Cuboid
 
@@ -180,6 +194,12 @@ class InCuboid(NamedTuple):
     def leave(self, points: Float[Array, "batch point 3"]) -> Float[Array, "batch point 3"]:
         """To metres."""
         return denormalised(points, self.cuboid)
+
+    def move(
+        self, points: Float[Array, "batch point 3"], offset: Float[Array, "batch point 3"]
+    ) -> Float[Array, "batch point 3"]:
+        """Add the offset to the logits of the shares."""
+        return sigmoid_step(points, offset)
 
 
 def space_of(config: PoemV1Config, root: Float[Array, "batch 3"] | None) -> AboutRoot | InCuboid:

@@ -143,6 +143,7 @@ class Poem(nnx.Module):
             valid,
             jnp.stack(layers, 1) + root[:, None, None],
             parameters,
+            solved,
         )
         return leave_working_frame(found, frame, hand, config.decoder.query_order)
 

@@ -22,7 +22,10 @@ from flax import nnx
 
 from poem_jax.geometry.neighbours import nearest
 from poem_jax.models.layers import linear
-from poem_jax.typing import Array, Float, Int
+from poem_jax.typing import Array, Bool, Float, Int
+
+_FAR = 1e6
+"""Where points that are not to be found stand for the search; coordinates are at most some hundreds."""
 
 _TOGETHER = 8
 """Neighbours times samples that are visited at once: enough to share a product between cores."""
@@ -48,10 +51,17 @@ class Neighbours(NamedTuple):
 
 
 def nearest_neighbours(
-    queries: Float[Array, "batch query 3"], points: Float[Array, "batch point 3"], k: int
+    queries: Float[Array, "batch query 3"],
+    points: Float[Array, "batch point 3"],
+    k: int,
+    point_mask: Bool[Array, "batch point"] | None = None,
 ) -> Neighbours:
-    """Find the `k` points nearest to each query; the search has no derivative, the positions have."""
-    index = jnp.moveaxis(nearest(queries, points, k), -1, 0)
+    """Find the `k` points nearest to each query; the search has no derivative, the positions have.
+
+    `point_mask`: True = a point that may be found, None = all; where fewer than `k` may, others fill up.
+    """
+    searched = points if point_mask is None else jnp.where(point_mask[..., None], points, _FAR)
+    index = jnp.moveaxis(nearest(queries, searched, k), -1, 0)
     return Neighbours(index, jax.vmap(_rows, (None, 0))(points, index))
 
 

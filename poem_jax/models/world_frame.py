@@ -53,6 +53,8 @@ class Reconstruction(NamedTuple):
     layers: Float[Array, "batch layer query 3"]
     """Query points after every layer, in the order of the config."""
     parameters: HandParameters | None
+    reference_mask: Bool[Array, "batch joint"] | None = None
+    """Which key points could be triangulated."""
 
 
 def enter_working_frame(
@@ -119,6 +121,7 @@ def leave_working_frame(
         layers_world=layers_world,
         valid=found.valid & frame.complete,
         reference_joints_world=_to_world(frame, reference) if has_all_joints else None,
+        reference_joints_mask=found.reference_mask if has_all_joints else None,
     )
     if found.parameters is None:
         return prediction

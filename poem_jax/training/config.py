@@ -102,6 +102,16 @@ class TrainingRoot:
     """Standard deviation of one number added to all coordinates of the batch (the release: 0.01)."""
     scale: float = 0.0
     """Largest relative scaling about the noisy wrist, one number per batch (the release: 0.01)."""
+    max_error_m: float | None = 0.1
+    """A sample whose root is farther than this from the true one does not count in the losses of the second
+    stage, which sees nothing of the hand there and could only learn the mean: no basis point, in a ball of
+    this radius, lies on the hand. None = all count, as in the release of POEM v1."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.max_error_m is None or self.max_error_m > 0,
+            f"`max_error_m` must be positive, or None; got {self.max_error_m}",
+        )
 
 
 PAPER_ROOT = TrainingRoot()
@@ -326,6 +336,7 @@ _LATER = {
     "loss.reprojection_limit": 0.5,
     "loss.triangulation": 0.0,
     "loss.vertex_reprojection": 0.0,
+    "training_root.max_error_m": 0.1,
 }
 """Fields that runs of earlier versions do not name, and what they did."""
 

@@ -25,9 +25,6 @@ from poem_jax.typing import Array, Float, Params, PRNGKeyArray
 
 Metrics = dict[str, Array]
 
-MAX_ROOT_ERROR_M = 0.1
-"""The radius of the ball of basis points."""
-
 
 def train_step(
     state: TrainState,
@@ -89,7 +86,7 @@ def train_step(
             errors = keypoint_error(prediction, batch, axis_name=axis_name)
         else:
             loss, terms = multi_view_losses(
-                near_the_hand(prediction, batch),
+                near_the_hand(prediction, batch, config.training_root.max_error_m),
                 batch,
                 hand=hand,
                 image_hw=image_hw,
@@ -139,16 +136,12 @@ def noisy_root(
     return wrist + (1.0 + noise.scale * jax.random.uniform(scale_key, minval=-1.0)) * (root - wrist)
 
 
-def near_the_hand(prediction: Prediction, batch: MultiViewBatch) -> Prediction:
-    """Mark samples as unsolved whose root went so far astray that no basis point lies on the hand.
-
-    Their second stage sees nothing of the hand and could only learn the mean. A model without a root keeps
-    all.
-    """
-    if prediction.root_world is None:
+def near_the_hand(prediction: Prediction, batch: MultiViewBatch, max_error_m: float | None) -> Prediction:
+    """Mark samples as unsolved whose root is farther than this from the true one
+    (`TrainingRoot.max_error_m`); a model without a root keeps all."""
+    if prediction.root_world is None or max_error_m is None:
         return prediction
-    root = batch.joints_world[:, ROOT_JOINT]
-    near = _distance(prediction.root_world, root) < MAX_ROOT_ERROR_M
+    near = _distance(prediction.root_world, batch.joints_world[:, ROOT_JOINT]) < max_error_m
     return prediction._replace(valid=prediction.valid & near)
 
 

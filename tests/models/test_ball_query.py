@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.models.ball_query import draw_ball, points_at, repeated
+from poem_jax.models.ball_query import draw_ball, filled, points_at
 from poem_jax.models.frustum_config import FrustumConfig
 from poem_jax.models.poem_v1_config import BallConfig
 
@@ -64,7 +64,7 @@ def test_masked_views_are_not_drawn_and_change_nothing(grid):
     np.testing.assert_array_equal(found, np.where(expected >= size, expected + size, expected))
 
 
-def test_what_a_ball_lacks_is_told_and_repeated(grid):
+def test_what_a_ball_lacks_is_told_and_filled_by_its_first(grid):
     few = BallConfig(40, 0.3, FrustumConfig(4))
     ball = _draw(grid, config=few)
     count = int(ball.count[0])
@@ -72,7 +72,8 @@ def test_what_a_ball_lacks_is_told_and_repeated(grid):
     index = np.asarray(ball.index[0])
     assert (index[:count] >= 0).all()
     assert (index[count:] == -1).all()
-    np.testing.assert_array_equal(repeated(ball.index)[0], np.resize(index[:count], 40))
+    np.testing.assert_array_equal(filled(ball.index)[0], [*index[:count]] + [index[0]] * (40 - count))
+    np.testing.assert_array_equal(filled(jnp.array([[-1, 7, -1, 3, 0]])), [[7, 7, 7, 3, 0]])
     np.testing.assert_array_equal(points_at(grid, ball.index)[0, count:], 0)
 
 
@@ -80,4 +81,4 @@ def test_an_empty_ball_counts_nothing(grid):
     ball = _draw(grid + 10)
     np.testing.assert_array_equal(ball.count, 0)
     assert (np.asarray(ball.index) == -1).all()
-    np.testing.assert_array_equal(repeated(ball.index), 0)
+    np.testing.assert_array_equal(filled(ball.index), 0)

@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle, transform_points
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT, split_queries
+from poem_jax.models import apply as apply_checks
+from poem_jax.models.apply import check_inputs
+from poem_jax.models.ball_query import draw_ball
 from poem_jax.models.config import Design, FrozenNorms, ResNetConfig, RootConfig, Stem
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum import frustum_grid
@@ -31,8 +35,8 @@ from poem_jax.models.poem_v1_config import (
     QueryEmbedding,
     TokenDecoderConfig,
 )
-from poem_jax.models.poem_v1_release import UnnormalisedAggregation, own_channels, projected_anyhow
-from poem_jax.models.poem_v1_start import LinearMesh, Start
+from poem_jax.models.poem_v1_release import CodedMaps, UnnormalisedAggregation, projected_anyhow
+from poem_jax.models.poem_v1_start import LinearMesh, Start, space_of
 from poem_jax.models.world_frame import enter_working_frame
 
 METRES = 1e-8
@@ -67,6 +71,7 @@ CONFIGS = {
         query_embedding=QueryEmbedding.POINT_CODES,
     ),
 }
+DEEP = BallConfig(48, 0.1, FrustumConfig(6, 0.4, 0.8))
 DRAWING = [name for name, config in CONFIGS.items() if config.grid_draw is not None]
 
 
@@ -237,6 +242,46 @@ def test_other_views_are_a_set_but_for_the_release(name, make_scene):
         assert np.abs(turned - found).max() > 1e-4
 
 
+def test_no_basis_point_is_read_twice_where_the_ball_holds_few(make_scene):
+    """20 points fill 48 places: neither their order nor where the copies stand changes anything."""
+    views, cams = make_scene(2, 4)
+    few = np.where(np.arange(48) < 20, _ball_index(V1, 4), -1).astype(np.int32)
+    mixed = few[:, np.random.default_rng(1).permutation(48)]
+    expected, found = (predict(V1, views, cams, ball_index=index).layers_world for index in (few, mixed))
+    np.testing.assert_allclose(found, expected, atol=METRES)
+    other = np.where(np.arange(48) == 3, few[:, :1], few)
+    assert np.abs(predict(V1, views, cams, ball_index=other).layers_world - expected).max() > 1e-5
+
+
+def test_a_draw_of_few_points_can_be_given_back(make_scene):
+    """As indices with -1."""
+    views, cams = make_scene(2, 4)
+    cams = _masked(cams, [[1, 0, 0, 1]] * 2)
+    drawn = predict(V1, views, cams)
+    with jax.enable_x64(True):
+        frame = enter_working_frame(views, cams, None, np.float64)
+        root = transform_points(cams.T_cam_from_world[:, 0], drawn.root_world[:, None])[:, 0]
+        grid = frustum_grid(V1.basis.frustum, Cameras(*map(jnp.asarray, frame.cams)), V1.map_hw, V1.image_hw)
+        ball = draw_ball(V1.basis, grid, jnp.asarray(root), jnp.asarray(cams.view_mask), jax.random.key(0))
+    index = np.asarray(ball.index, np.int32)
+    assert (index.min(1) == -1).all()
+    check_inputs(views, cams, None, V1, ball_index=index)
+    found = predict(V1, views, cams, ball_index=index)
+    assert found.valid.all()
+    np.testing.assert_allclose(found.layers_world, drawn.layers_world, atol=METRES)
+
+
+def test_one_stage_stays_in_its_cuboid():
+    """`test_poem_v1_equations.py` has the decoder move points by its space."""
+    space = space_of(CONFIGS["v1-1stage"], None)
+    shares = jnp.array([[[0.1, 0.5, 0.9]]] * 3)
+    points = space.leave(space.move(shares, jnp.array([[[-9.0] * 3], [[0.0] * 3], [[9.0] * 3]])))
+    np.testing.assert_allclose(points[1, 0], [-0.4, 0.0, 0.92], atol=1e-5)
+    assert (points > jnp.array(CUBOID.low)).all()
+    assert (points < jnp.array(CUBOID.high)).all()
+    assert (jnp.abs(points[2] - points[0]) > 0.7).all()
+
+
 @pytest.mark.parametrize("name", DRAWING)
 def test_the_key_draws_the_basis_points(name, scene):
     zero, one = (predict(CONFIGS[name], *scene, key=jax.random.key(i)).layers_world for i in (0, 1))
@@ -248,7 +293,7 @@ def test_without_a_key_it_is_key_0(make_scene):
     cams = Cameras(*map(jnp.asarray, make_scene(1, 4)[1]))
     grid = frustum_grid(V1.basis.frustum, cams, V1.map_hw, V1.image_hw)
     centre = jnp.mean(grid, (1, 2, 3, 4))
-    start = Start(jnp.zeros((1, NUM_QUERIES, 3)), centre, None, None, jnp.ones(1, bool))
+    start = Start(jnp.zeros((1, NUM_QUERIES, 3)), centre, None, None, None, jnp.ones(1, bool))
     default, zero, one = (
         module._basis(None, grid, start, cams, key).index
         for key in (None, jax.random.key(0), jax.random.key(1))
@@ -269,6 +314,44 @@ def test_a_ball_without_points_is_not_valid_and_finite(name, scene):
     assert (np.abs(found.reference_joints_world).max((1, 2)) > 0).all()
 
 
+_EMPTY = r"lie in the ball about {}; in samples \[1\] none does"
+
+
+@pytest.mark.parametrize(
+    ("name", "unsolved", "root", "message"),
+    [
+        (
+            "release",
+            [4, 8],
+            None,
+            r"all 21 joints .* in samples \[1\] the rays to joints \[4, 8\] meet behind",
+        ),
+        ("release", [], None, _EMPTY.format("the triangulated hand")),
+        ("v1", [4, 8], None, _EMPTY.format("the hand's root joint")),
+        ("v1", [], [[0, 0, 0]] * 2, _EMPTY.format("the hand's root joint")),
+        (
+            "v1-1stage",
+            [],
+            None,
+            _EMPTY.format(r"`first_stage.origin` = \(0.0, 0.0, 0.6\), metres before the pri.*"),
+        ),
+    ],
+)
+def test_the_cause_of_no_answer_is_named(name, unsolved, root, message, scene, monkeypatch):
+    """Of a sample whose rays to the root meet; where the root is given, there may be one ray."""
+    monkeypatch.setattr(apply_checks, "_rays_meet", lambda cams, uv_px: np.ones(2, bool))
+    views, cams = scene
+    root = None if root is None else np.array(root, np.float32)
+    if root is not None:
+        cams = _masked(cams, [[1, 1, 1, 1], [1, 0, 0, 0]])
+    uv_px, _ = project(cams.K, cams.T_cam_from_world, np.zeros((1, 1, NUM_JOINTS, 3)))
+    mask = np.ones((2, NUM_JOINTS), bool)
+    mask[1, unsolved] = False
+    found = Prediction(None, None, None, uv_px, None, np.array([True, False]), reference_joints_mask=mask)
+    with pytest.raises(ValueError, match=message):
+        apply_checks.check_solved(found, enter_working_frame(views, cams, root, np.float32), CONFIGS[name])
+
+
 def test_known_root_is_used_where_the_system_has_one(make_scene):
     views, cams = make_scene(2, 4)
     cams = _masked(cams, [[1, 0, 0, 0], [1, 1, 1, 1]])
@@ -284,15 +367,17 @@ def test_known_root_is_used_where_the_system_has_one(make_scene):
     ]
 
 
-def test_one_program_for_all_masks(make_scene):
-    views, cams = make_scene(2, 4)
-    masks = ([[1, 1, 0, 1], [0, 1, 1, 0]], [[0, 0, 1, 1], [1, 1, 1, 1]])
-    for config in (V1, RELEASE):
-        predict(config, views, _masked(cams, np.ones((2, 4))))
-        programs = model_of(config).run._cache_size()
-        for mask in masks:
-            predict(config, views, _masked(cams, mask))
-        assert model_of(config).run._cache_size() == programs
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[] if name == "v1" else pytest.mark.slow) for name in CONFIGS],
+)
+def test_one_program_for_1_to_8_views(name, make_scene):
+    views, cams = make_scene(1, 8)
+    run = model_of(CONFIGS[name]).run
+    programs = run._cache_size()
+    for count in range(1, 9):
+        predict(CONFIGS[name], views, _masked(cams, [[i < count for i in range(8)]]))
+    assert run._cache_size() == programs + 1
 
 
 @pytest.mark.slow
@@ -384,15 +469,26 @@ def test_a_camera_sees_its_own_centre_at_pixel_zero_in_the_release(make_scene):
     np.testing.assert_allclose(uv_px[0, 1], expected[0, 1], rtol=1e-5)
 
 
-def test_grid_points_own_the_channels_of_their_depth():
-    """A cell's channels are (feature, depth), its points are numbered (view, w, h, depth)."""
-    view, h, w, features, depths = 2, 3, 4, 5, 6
+@pytest.mark.parametrize("name", ["v1-wo-proj", "release-wo-proj"])
+def test_grid_points_own_the_channels_of_their_depth(name):
+    """Points are numbered (view, w, h, depth); a cell's channels are (depth, feature) in the paper, B_cam
+    reshaped to (W, H, D, C / D), and (feature, depth) in the release."""
+    view, h, w, features, depths = 2, 3, 4, 6, 4
     maps = np.random.default_rng(0).normal(size=(1, view, h, w, features * depths)).astype(np.float32)
-    places = [(0, 0, 0, 0), (1, 3, 2, 5), (1, 0, 2, 1), (0, 3, 0, 4)]
+    basis = PoemV1(CONFIGS[name], default_hand(), rngs=nnx.Rngs(0)).second.basis
+    basis.enlarge = lambda channels: jnp.pad(channels, [(0, 0), (0, 0), (0, V1.width - features)])
+    cams = Cameras(jnp.zeros((1, view, 3, 3)), jnp.zeros((1, view, 4, 4)), jnp.ones((1, view), bool))
+    points, maps = jnp.zeros((1, 5, 3)), jnp.asarray(maps)
+    places = [(0, 0, 0, 0), (1, 3, 2, 3), (1, 0, 2, 1), (0, 3, 0, 2)]
     index = [np.ravel_multi_index(place, (view, w, h, depths)) for place in places]
-    found = own_channels(jnp.asarray(maps), depths, jnp.array([[*index, -1]]))
-    expected = [maps[0, v, y, x].reshape(features, depths)[:, d] for v, x, y, d in places]
-    np.testing.assert_array_equal(found[0], [*expected, np.zeros(features)])
+    index = jnp.array([[*index, -1]])
+    if name == "v1-wo-proj":
+        found = basis(maps, cams, points, index)
+        expected = [maps[0, v, y, x].reshape(depths, features)[d] for v, x, y, d in places]
+    else:
+        found, _ = basis(CodedMaps(maps, maps), cams, points, points, index)
+        expected = [maps[0, v, y, x].reshape(features, depths)[:, d] for v, x, y, d in places]
+    np.testing.assert_array_equal(found[0, :, :features], [*expected, np.zeros(features)])
 
 
 @pytest.mark.parametrize(
@@ -408,6 +504,14 @@ def test_grid_points_own_the_channels_of_their_depth():
             "64 grid points of one view; got 1000",
         ),
         ({"image_hw": (36, 36)}, "coarsest stride"),
+        (
+            {"basis_features": BasisFeatures.OWN_CAMERA, "decoder": CONFIGS["v1-wo-pt"].decoder},
+            "`basis_features` must be projected .*; got own_camera",
+        ),
+        (
+            {"width": 32, "decoder": CONFIGS["v1-wo-pt"].decoder, "basis": DEEP},
+            "`width` must give each of the 6",
+        ),
     ],
 )
 def test_bad_configs_are_refused(change, message):

@@ -25,6 +25,7 @@ NOT_THERE = (
     "keypoints_px",
     "heat_maps",
     "reference_joints_world",
+    "reference_joints_mask",
     "pose",
     "shape",
     "translation",
@@ -135,16 +136,31 @@ def test_one_key_one_draw(make_scene):
         ({"ball_index": np.zeros((2, 3), np.int32)}, r"shape \(batch, point\) = \(2, 4\); got \(2, 3\)"),
         ({"ball_index": np.zeros((2, 4), np.float32)}, "an array of whole numbers; got float32"),
         ({"ball_index": [[0] * 4] * 2}, "an array of whole numbers; got list"),
-        ({"ball_index": np.full((2, 4), -1)}, "number the 24 grid points of 4 views, 0 to 23; got -1 to -1"),
-        ({"ball_index": np.full((2, 4), 24)}, "0 to 23; got 24 to 24"),
+        (
+            {"ball_index": np.full((2, 4), -2)},
+            "24 grid points of 4 views, 0 to 23, with -1 .* -2 to",
+        ),
+        ({"ball_index": np.full((2, 4), 24)}, "0 to 23, .*; got 24 to 24"),
+        ({"ball_index": np.array([[0, -1, 5, -1], [-1] * 4])}, r"in samples \[1\] all are -1"),
+        (
+            {"ball_index": np.array([[0, 5, 7, 11], [0, 6, 17, 18]])},
+            r"samples \[0, 1\] name points of the masked views \[1, 3\]",
+        ),
         ({"key": 3}, "`key` must be one key of `jax.random`; got 3"),
         ({"key": jax.random.split(jax.random.key(0))}, "`key` must be one key"),
     ],
 )
 def test_a_wrong_draw_is_one_line(given, what, make_scene):
     views, cams = make_scene(2, 4)
+    cams = cams._replace(view_mask=np.array([[1, 0, 1, 1], [1, 1, 1, 0]], bool))
     with pytest.raises(ValueError, match=what):
         check_inputs(views, cams, None, DRAWING, **given)
+
+
+def test_a_draw_of_a_ball_that_held_fewer_points_is_taken(make_scene):
+    views, cams = make_scene(2, 4)
+    cams = cams._replace(view_mask=np.array([[1, 0, 1, 1], [1, 1, 1, 0]], bool))
+    check_inputs(views, cams, None, DRAWING, ball_index=np.array([[0, 23, -1, -1], [6, -1, 17, -1]]))
 
 
 def test_a_number_of_views_that_the_layers_are_not_made_for(make_scene):

@@ -93,6 +93,21 @@ def test_gradients_match_finite_differences():
             np.testing.assert_allclose(difference, jnp.sum(gradient * step), rtol=5e-4)
 
 
+def test_masked_points_are_found_only_where_too_few_are_left():
+    points = jnp.asarray(np.random.default_rng(3).normal(size=(1, 40, 3)), jnp.float32)
+    queries = points[:, :6]
+    for held, distinct in ((12, 8), (8, 8), (5, 5)):
+        mask = jnp.arange(40) < held
+        copies = jnp.where(mask[:, None], points, points[:, :1])
+        index = np.asarray(nearest_neighbours(queries, copies, 8, mask[None]).index)[:, 0]
+        assert index.shape == (8, 6)
+        for of_query in index.T:
+            assert sorted(of_query[of_query < held]) == sorted(set(of_query[of_query < held]))
+            assert (of_query < held).sum() == distinct
+        nearest = np.argsort(np.linalg.norm(copies[0, :held] - queries[0, :, None], axis=-1), -1)
+        np.testing.assert_array_equal(index.T[:, :distinct], nearest[:, :distinct])
+
+
 def test_nearest_neighbours_stand_where_their_points_are():
     points = RNG.normal(size=(BATCH, POINTS, 3)).astype(np.float32)
     found = nearest_neighbours(POSITIONS, points, K)

@@ -1,9 +1,20 @@
+from dataclasses import replace
+
 import pytest
 
 from poem_jax import losses
 from poem_jax.experiments.synthetic_benchmark import benchmark
+from poem_jax.models.poem_v1_config import BallConfig
 from poem_jax.models.presets import preset
-from poem_jax.training.config import RELEASE_ROOT, Clip, DataConfig, OptimizerConfig, Schedule
+from poem_jax.training.config import (
+    RELEASE_ROOT,
+    Clip,
+    DataConfig,
+    OptimizerConfig,
+    RootSource,
+    Schedule,
+    TrainingRoot,
+)
 from poem_jax.training.recipes import experiment
 from poem_jax.training.state import learning_rate
 
@@ -38,6 +49,14 @@ def test_the_parametric_release_ends_at_a_thousandth_of_its_rate():
     config = experiment("release-mano", **REST)
     assert learning_rate(config)(config.train.steps) == pytest.approx(1e-7, rel=0.01)
     assert config.loss is losses.RELEASE
+
+
+def test_poem_v1_trains_about_the_root_that_it_triangulates():
+    """The release counts all samples, however far astray that root is."""
+    own, released = (experiment(name, **REST).training_root for name in ("v1", "v1-release"))
+    assert own == TrainingRoot(source=RootSource.TRIANGULATED)
+    assert own.max_error_m == BallConfig().radius
+    assert released == replace(own, max_error_m=None)
 
 
 def test_unknown_recipes_are_named():

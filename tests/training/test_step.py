@@ -15,7 +15,9 @@ import optax
 import pytest
 
 import poem_jax
+from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras
+from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.losses import match_keypoints
 from poem_jax.training.config import (
     RELEASE_ROOT,
@@ -35,7 +37,7 @@ from poem_jax.training.parallel import (
     stack_for_devices,
 )
 from poem_jax.training.state import create_state, restart_moments
-from poem_jax.training.step import existing_views, noisy_root, train_step
+from poem_jax.training.step import existing_views, near_the_hand, noisy_root, train_step
 
 KEY = jax.random.key(3)
 TOLERANCE = {"rtol": 1e-4, "atol": 1e-6}
@@ -201,6 +203,21 @@ def test_root_noise_belongs_to_the_sample():
     shards = jax.pmap(partial(draw, axis_name="x"), axis_name="x", devices=jax.devices())
     split = shards(joints.reshape(jax.device_count(), -1, 21, 3))
     np.testing.assert_allclose(split.reshape(8, 3), draw(joints), rtol=1e-6)
+
+
+def test_roots_astray_do_not_count_unless_the_recipe_says_so(micro_batch):
+    """As given in `TrainingRoot.max_error_m`; a model without a root keeps all."""
+    away = np.array([0.0, 0.05, 0.2, 3.0, 0.0, 0.0, 0.0, 0.0], np.float32)
+    root = micro_batch.joints_world[:, ROOT_JOINT] + away[:, None] * np.array([0, 0.6, 0.8], np.float32)
+    solved = np.array([True] * 7 + [False])
+    found = Prediction(None, None, root, None, None, solved)
+    for limit, expected in ((0.1, solved & (away < 0.1)), (1.0, solved & (away < 1)), (None, solved)):
+        np.testing.assert_array_equal(near_the_hand(found, micro_batch, limit).valid, expected)
+    np.testing.assert_array_equal(
+        near_the_hand(found._replace(root_world=None), micro_batch, 0.1).valid, solved
+    )
+    with pytest.raises(ValueError, match=r"`max_error_m` must be positive, or None; got 0\.0"):
+        TrainingRoot(max_error_m=0.0)
 
 
 def test_first_stage_trains_the_heat_maps_alone(micro_params, config, micro_batch):
