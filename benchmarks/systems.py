@@ -3,17 +3,18 @@
 `infer(prepare(params, config), ...)` of one sample: 8 views, or what a system takes, of random pixels, with
 fresh weights, which find no hand but cost the same. Each preset in a process of its own, with the allocator
 settings of the `poem` command; the median of 7 calls after one that does not count, and the process's peak
-memory. Nothing stands beside it: for comparisons see `inference.py` and `against_release.py`.
+memory, compiling included. For comparisons see `inference.py` and `against_release.py`.
 """
 
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
 import time
+
+from torch_release.turns import peak_gb  # beside this file
 
 from poem_jax.io.allocator import SETTINGS
 from poem_jax.models.presets import PRESETS
@@ -36,7 +37,7 @@ def main() -> None:
     for name in given.preset or PRESETS:
         command = [sys.executable, __file__, "--job", name]
         environment = {**os.environ, "GLIBC_TUNABLES": SETTINGS}
-        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+        done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
         found = json.loads(done.stdout.splitlines()[-1])
         print(f"| `{name}` | {found['views']} | {found['seconds']:.2f} | {found['gb']:.2f} |", flush=True)
 
@@ -65,8 +66,7 @@ def _time(name: str) -> dict:
         start = time.perf_counter()
         jax.block_until_ready(infer_unchecked(prepared, images, cams, root_world=root))
         times.append(time.perf_counter() - start)
-    peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"views": views, "seconds": statistics.median(times[1:]), "gb": peak_kib / 2**20}
+    return {"views": views, "seconds": statistics.median(times[1:]), "gb": peak_gb()}
 
 
 if __name__ == "__main__":

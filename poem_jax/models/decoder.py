@@ -33,6 +33,7 @@ from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
 PAPER_EPSILON, RELEASE_EPSILON = 1e-5, 1e-12
 """Of the layer norms."""
 _FOLD = 16
+"""Stretches of a row that are joined at a time."""
 _OFFSET_M = 0.01
 """The joint decoder regresses offsets in centimetres."""
 _EMBEDDING_SCALE = 0.3
@@ -334,8 +335,8 @@ def _attend(
 def _folded(
     join: Callable[[Array, Array], Array], rows: Float[Array, "query token"]
 ) -> Float[Array, "query short"]:
-    """Join stretches of every row side by side: along a long row XLA:CPU goes several times as slowly."""
-    while rows.shape[-1] % _FOLD == 0:
+    """Join stretches of every row side by side: XLA:CPU takes several times as long along a row."""
+    while rows.shape[-1] and rows.shape[-1] % _FOLD == 0:
         rows = functools.reduce(join, jnp.split(rows, _FOLD, -1))
     return rows
 

@@ -2,7 +2,8 @@
 
 `apply` is one pure program over padded views. Here the valid views of a batch are packed into chunks of a
 fixed size for the trunk, which is most of the work, and the hand is then found sample by sample, so that the
-cost follows the views that there are. All shapes are fixed by the padded batch: new masks compile nothing.
+cost follows the views that there are. All shapes are fixed by the padded batch: once the few programs below
+are there, new masks compile nothing.
 
 On a CPU a chunk is two views, which read the weights once, or one, and as many threads as cores each run a
 program that uses one thread: XLA:CPU shares a single convolution badly among cores. Programs for few and for
@@ -156,7 +157,8 @@ def _look_at_valid(prepared: Prepared, views: np.ndarray, valid: np.ndarray) -> 
     sizes = _chunk_sizes(len(packed))
     packed = np.concatenate([packed, np.zeros((sum(sizes) - len(packed), *packed.shape[1:]), packed.dtype)])
     starts = [0, *itertools.accumulate(sizes)]
-    buffers = _empty_features(prepared, views.dtype, valid.size + max(sizes, default=1))
+    spare = 1 if _on_cpu() else _VIEWS_AT_A_TIME
+    buffers = _empty_features(prepared, views.dtype, valid.size + spare)
     chunks = [packed[start:end] for start, end in itertools.pairwise(starts)]
     for seen, start in zip(_run_all(_look, prepared, chunks), starts[:-1], strict=True):
         buffers = _write(buffers, seen, start)

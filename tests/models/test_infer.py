@@ -8,6 +8,7 @@ import pytest
 
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models import infer as inference
+from poem_jax.models import layers
 from poem_jax.models.apply import apply
 from poem_jax.models.config import (
     AggregationConfig,
@@ -165,19 +166,45 @@ def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkey
     monkeypatch.setattr(inference, "_cores", lambda: 2)
     views, cams = make_scene(3, 4)
     prepared = prepare(make_params(micro_config), micro_config)
-    # Seven views: two pairs and three single ones.
-    infer(prepared, views, cams._replace(view_mask=np.arange(12).reshape(3, 4) % 5 > 1))
+
+    def give(count):
+        mask = (np.arange(12) < count).reshape(3, 4)
+        inference.infer_unchecked(prepared, views, cams._replace(view_mask=mask))
+
+    for count in (12, 3, 1):  # Pairs, single views on all cores, one view.
+        give(count)
     halves = (inference._look, inference._find)
     jitted = [inference._cpu_program(half, alone) for half in halves for alone in (True, False)]
     jitted += [inference._look, inference._find, inference._write, inference._read]
     before = [program._cache_size() for program in jitted]
-    for mask in (~MASK | np.array([True, True, False, False]), np.ones((3, 4), bool)):
-        infer(prepared, views, cams._replace(view_mask=mask))
+    for count in range(12):
+        give(count)
     assert [program._cache_size() for program in jitted] == before
 
 
+def test_transformed_kernels_change_nothing(micro_config, make_params, make_scene, monkeypatch):
+    """In float64; so few channels are not transformed unless told so, and never on an accelerator."""
+    monkeypatch.setattr(layers, "_FILTERED_CHANNELS", range(1, 999))
+    monkeypatch.setattr(layers, "_FILTERED_PIXELS", 1)
+    views, cams = make_scene(2, 3)
+    with jax.enable_x64(True):
+        params = in_float64(make_params(micro_config))
+        prepared = prepare(params, micro_config)
+        assert sum(jax.tree.leaves(_reshaped(prepared.params, params))) > 3
+        found = infer(prepared, views / 255.0, cams)
+        expected = apply(params, views / 255.0, cams, config=micro_config)
+        np.testing.assert_allclose(found.vertices_world, expected.vertices_world, atol=1e-8)
+    monkeypatch.setattr(inference, "_on_cpu", lambda: False)
+    params = make_params(micro_config)
+    assert not any(jax.tree.leaves(_reshaped(prepare(params, micro_config).params, params)))
+
+
+def _reshaped(after, before):
+    return jax.tree.map(lambda a, b: a.shape != b.shape, after["trainable"], before["trainable"])
+
+
 @pytest.mark.parametrize("cores", [1, 2, 3, 16])
-def test_pairs_of_views_never_leave_a_core_without_work(cores, monkeypatch):
+def test_views_go_in_pairs_while_there_is_one_for_every_core(cores, monkeypatch):
     monkeypatch.setattr(inference, "_cores", lambda: cores)
     for count in range(40):
         sizes = inference._chunk_sizes(count)

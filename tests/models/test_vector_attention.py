@@ -133,6 +133,29 @@ def test_anchors_are_neighbours_of_every_query(module):
     np.testing.assert_allclose(module(EMBEDDINGS, POSITIONS, FEATURES, known), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(("k", "batch"), [(16, 1), (9, 2), (12, 4)])
+def test_known_deltas_are_read_in_groups_with_the_same_result_and_gradients(k, batch):
+    rng = np.random.default_rng(k)
+    with jax.enable_x64(True):
+        module = VectorAttention(WIDTH, rngs=nnx.Rngs(0))
+        nnx.update(module, jax.tree.map(lambda leaf: leaf.astype(np.float64), nnx.state(module)))
+        queries, points = rng.normal(size=(1, QUERIES, 3)), rng.normal(size=(1, 20, 3))
+        one_by_one = nearest_neighbours(jnp.asarray(queries), jnp.asarray(points), k)
+        tiled = one_by_one._replace(index=jnp.tile(one_by_one.index, (1, batch, 1)))
+        grouped = module.with_deltas(queries, one_by_one)._replace(index=tiled.index)
+        embeddings, features = (
+            rng.normal(size=(batch, count, WIDTH)) * 3 for count in (QUERIES, points.shape[1])
+        )
+
+        def read(embeddings, features, neighbours):
+            moved = module(embeddings, jnp.tile(queries, (batch, 1, 1)), features, neighbours)
+            return jnp.sum(moved * jnp.arange(WIDTH)), moved
+
+        run = jax.value_and_grad(read, (0, 1), has_aux=True)
+        got, expected = (run(embeddings, features, n) for n in (grouped, tiled))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), got, expected)
+
+
 def test_bracketed_attention_maps_before_and_after():
     module = BracketedVectorAttention(WIDTH, rngs=nnx.Rngs(1))
     near = _of(NEIGHBOURS)
