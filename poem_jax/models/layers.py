@@ -225,16 +225,31 @@ def repeat_pixels(x: Float[Array, "image h w c"], factor: int) -> Float[Array, "
     return tiled.reshape(image, h * factor, w * factor, c)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def max_pool(x: Float[Array, "image h w c"], factor: int) -> Float[Array, "image h2 w2 c"]:
-    """Reduce to the largest of every `factor` x `factor` pixels.
+    """Reduce to the largest of every `factor` x `factor` pixels."""
+    return jnp.max(_cells(x, factor), (2, 4))
 
-    Two by two: the gradient of one maximum of many looks for the number that equals it, and where a compiler
-    computes that number twice, rounded differently, none does and the gradient is 0 / 0.
+
+@max_pool.defjvp
+def _max_pool_jvp(factor: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """Differentiate the maxima of two by two.
+
+    The gradient of one maximum of many looks for the number that equals it, and where a compiler computes
+    that number twice, rounded differently, none does and the gradient is 0 / 0.
     """
+
+    def two_by_two(x: Array) -> Array:
+        cells = _cells(x, factor)
+        rows = functools.reduce(jnp.maximum, (cells[:, :, i] for i in range(factor)))
+        return functools.reduce(jnp.maximum, (rows[..., i, :] for i in range(factor)))
+
+    return jax.jvp(two_by_two, primals, tangents)
+
+
+def _cells(x: Array, factor: int) -> Array:
     image, h, w, c = x.shape
-    cells = x.reshape(image, h // factor, factor, w // factor, factor, c)
-    rows = functools.reduce(jnp.maximum, (cells[:, :, i] for i in range(factor)))
-    return functools.reduce(jnp.maximum, (rows[..., i, :] for i in range(factor)))
+    return x.reshape(image, h // factor, factor, w // factor, factor, c)
 
 
 def double_bilinear(x: Float[Array, "image h w c"]) -> Float[Array, "image h2 w2 c"]:
