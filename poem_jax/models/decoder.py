@@ -6,7 +6,6 @@ root. `JointDecoder` is ours and moves the 21 joints beforehand, by basis points
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -32,8 +31,6 @@ from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
 
 PAPER_EPSILON, RELEASE_EPSILON = 1e-5, 1e-12
 """Of the layer norms."""
-_FOLD = 16
-"""Stretches of a row that are joined at a time."""
 _OFFSET_M = 0.01
 """The joint decoder regresses offsets in centimetres."""
 _EMBEDDING_SCALE = 0.3
@@ -325,20 +322,10 @@ def _attend(
     if mask is not None:
         # Not minus infinity, of which a row without any valid token would make NaN.
         logits = jnp.where(mask, logits, jnp.finfo(logits.dtype).min)
-    largest = jnp.max(_folded(jnp.maximum, logits), -1, keepdims=True)
-    weights = jnp.exp(logits - jax.lax.stop_gradient(largest))
-    total = jnp.sum(_folded(jnp.add, weights), -1, keepdims=True)
+    weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, -1, keepdims=True)))
+    total = jnp.sum(weights, -1, keepdims=True)
     # Divided last: the map is passed over once less.
     return (dropout(weights, dropout_rate, key) @ v) / total
-
-
-def _folded(
-    join: Callable[[Array, Array], Array], rows: Float[Array, "query token"]
-) -> Float[Array, "query short"]:
-    """Join stretches of every row side by side: XLA:CPU takes several times as long along a row."""
-    while rows.shape[-1] and rows.shape[-1] % _FOLD == 0:
-        rows = functools.reduce(join, jnp.split(rows, _FOLD, -1))
-    return rows
 
 
 class JointDecoder(nnx.Module):
