@@ -83,7 +83,8 @@ def test_the_example_of_the_readme(run):
 
 
 def test_demo(run, tmp_path):
-    assert "MPVPE 5.4 mm" in run("poem", "demo")
+    (promised,) = re.findall(r"\*\*MPVPE (\d+\.\d) mm\*\*", (ROOT / "README.md").read_text())
+    assert f"MPVPE {promised} mm" in run("poem", "demo")
     assert (tmp_path / "out" / "demo" / "index.html").is_file()
 
 
