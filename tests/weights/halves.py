@@ -37,7 +37,7 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
     "input_proj": (point_features.FeatureBranch, "__call__", _whole),
     "pooled": (heat_maps, "max_pool", _whole),
     "position": (point_features.ViewRowColumnCode, "__call__", _whole),
-    "axis_codes": (point_features, "axis_code", _whole),
+    "place_codes": (point_features, "place_codes", _whole),
     "sampled": (poem_v2, "projected_features", lambda args, out: (out[0][:, :, ::128], out[1])),
     "tokens": (aggregation, "row_major_tokens", lambda args, out: out[:, :, ::128]),
     "basis_features": (aggregation.ProjectiveAggregation, "__call__", lambda args, out: out[:, ::64]),

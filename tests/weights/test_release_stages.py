@@ -96,7 +96,7 @@ def of_features(model: str) -> dict[str, np.ndarray]:
     count = int(seen[0].sum())
     named = {"input_proj_view0": channels_first(heard["input_proj"][0][0])}
     named["pos_sample0"] = channels_first(heard["position"][0][0, :count])[:, ::4]
-    named["sine_sample0_hw"] = channels_first(position_codes(*heard["axis_codes"])[:count, ::5, ::5])
+    named["sine_sample0_hw"] = channels_first(position_codes(*heard["place_codes"][0])[:count, ::5, ::5])
     uv_px = uv_share[seen] * IMAGE_HW[0]
     named["bps_uv_view0"], named["bps_uv_view_last"] = uv_px[0], uv_px[-1]
     named["sampled_feat_cols128"] = np.swapaxes(sampled[seen], -1, -2)
