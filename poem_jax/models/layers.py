@@ -116,6 +116,7 @@ def masked_moments(
 _FILTERED_CHANNELS, _FILTERED_PIXELS = range(40, 257), 256
 """Where minimal filtering is faster on a CPU, by channels and by the least map: of fewer channels no matrix
 product is filled, of more (or few pixels) reading the kernel, which grows, takes most of the time."""
+_LEAST_GRADIENT_CHANNELS = 32
 
 
 class Conv(nnx.Module):
@@ -128,9 +129,11 @@ class Conv(nnx.Module):
         self.kernel = nnx.Param(he_normal(rngs.params(), (size, size, c_in, c_out)))
         self.bias = nnx.Param(filled(0.0, c_out)) if bias else None
 
-    def __call__(self, x: Float[Array, "image h w c"]) -> Float[Array, "image h2 w2 c2"]:
-        """Convolve."""
-        y = self._pointwise(x) if self.size == 1 else self._windowed(x)
+    def __call__(
+        self, x: Float[Array, "image h w c"], *, training: bool = False
+    ) -> Float[Array, "image h2 w2 c2"]:
+        """Convolve. In `training` gradients may have a form of their own, which knows no forward mode."""
+        y = self._pointwise(x) if self.size == 1 else self._windowed(x, training)
         return y if self.bias is None else y + self.bias[...]
 
     def prepare_for_cpu(self, pixels: int) -> None:
@@ -146,17 +149,56 @@ class Conv(nnx.Module):
     def _pointwise(self, x: Array) -> Array:
         return x[:, :: self.stride, :: self.stride] @ self.kernel[...][0, 0]
 
-    def _windowed(self, x: Array) -> Array:
-        if len(self.kernel[...]) == winograd.TILE:
-            return winograd.convolve(x, self.kernel[...])
-        pad = (self.size - 1) // 2
-        return jax.lax.conv_general_dilated(
-            x,
-            self.kernel[...],
-            window_strides=(self.stride, self.stride),
-            padding=((pad, pad), (pad, pad)),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
+    def _windowed(self, x: Array, training: bool) -> Array:
+        kernel = self.kernel[...]
+        if len(kernel) == winograd.TILE:
+            return winograd.convolve(x, kernel)
+        if training and self.size == 3 and self.stride == 1 and _filters_gradients(x, kernel):
+            return _trained_convolution(x, kernel)
+        return convolve(x, kernel, self.stride)
+
+
+def convolve(
+    x: Float[Array, "image h w c_in"], kernel: Float[Array, "size size c_in c_out"], stride: int = 1
+) -> Float[Array, "image h2 w2 c_out"]:
+    """Convolve with (size - 1) / 2 pixels of zeros around the image."""
+    pad = (len(kernel) - 1) // 2
+    return jax.lax.conv_general_dilated(
+        x,
+        kernel,
+        window_strides=(stride, stride),
+        padding=((pad, pad), (pad, pad)),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+
+
+def _filters_gradients(x: Array, kernel: Array) -> bool:
+    """Whether minimal filtering is the faster gradient of a kernel on a CPU: for products that are filled."""
+    channels, tiles = kernel.shape[-2:], x.size // x.shape[-1] // 4
+    return min(channels) >= _LEAST_GRADIENT_CHANNELS and tiles >= max(channels)
+
+
+@jax.custom_vjp
+def _trained_convolution(x: Array, kernel: Array) -> Array:
+    """Convolve 3 x 3; on a CPU the gradient of the kernel goes by minimal filtering."""
+    return convolve(x, kernel)
+
+
+def _trained_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+    return convolve(x, kernel), (x, kernel)
+
+
+def _trained_backward(kept: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    x, kernel = kept
+
+    def plain(x: Array, gradient: Array) -> Array:
+        return jax.vjp(lambda kernel: convolve(x, kernel), kernel)[1](gradient)[0]
+
+    of_kernel = jax.lax.platform_dependent(x, gradient, cpu=winograd.kernel_gradient, default=plain)
+    return jax.vjp(lambda x: convolve(x, kernel), x)[1](gradient)[0], of_kernel
+
+
+_trained_convolution.defvjp(_trained_forward, _trained_backward)
 
 
 class ConvNorm(nnx.Module):
@@ -181,7 +223,7 @@ class ConvNorm(nnx.Module):
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h2 w2 c2"]:
         """Convolve, normalise, rectify."""
-        y = self.norm(self.conv(x), mode)
+        y = self.norm(self.conv(x, training=mode.training), mode)
         return jax.nn.relu(y) if self.relu else y
 
 

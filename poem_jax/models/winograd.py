@@ -4,7 +4,9 @@
 
 The product is one of matrices over channels for each of the 16 places of a tile: 16 products where the plain
 form takes 36. A CPU's matrix products run at nearly its full rate, XLA:CPU's convolutions at half of it.
-Rounding errors are a few times those of the plain form.
+Rounding errors are a few times those of the plain form. The gradient of the kernel is of the same form:
+
+    dL/dg = G^T [ sum over tiles (B^T d B) * (A dL/dY A^T) ] G
 """
 
 from collections.abc import Sequence
@@ -29,14 +31,8 @@ def convolve(
     x: Float[Array, "image h w c_in"], kernel: Float[Array, "4 4 c_in c_out"]
 ) -> Float[Array, "image h w c_out"]:
     """Convolve with a transformed kernel, one pixel of zeros around the image, stride 1."""
-    image, h, w, c_in = x.shape
-    rows, columns = -(-h // 2), -(-w // 2)
-    # Else what `x` is computed from would be computed anew for every place of a tile.
-    x = jax.lax.optimization_barrier(x)
-    around = ((0, 0), (1, 2 * rows - h + 1), (1, 2 * columns - w + 1), (0, 0))
-    pairs = jnp.pad(x, around).reshape(image, rows + 1, 2, columns + 1, 2, c_in)
-    by_row = _into_tiles(pairs[:, :, 0], pairs[:, :, 1], axis=1)
-    tiles = [_into_tiles(row[..., 0, :], row[..., 1, :], axis=2) for row in by_row]
+    image, h, w, _ = x.shape
+    tiles = _places_of_tiles(x)
     # Products one by one: XLA:CPU is slower at one of stacked matrices.
     by_column = [
         _out_of_tiles([place @ weights for place, weights in zip(row, kernels, strict=True)])
@@ -44,7 +40,44 @@ def convolve(
     ]
     pixels = zip(*(_out_of_tiles(column) for column in zip(*by_column, strict=True)), strict=True)
     y = jnp.stack([jnp.stack(row, 3) for row in pixels], 2)
+    rows, columns = y.shape[1], y.shape[3]
     return y.reshape(image, 2 * rows, 2 * columns, -1)[:, :h, :w]
+
+
+def kernel_gradient(
+    x: Float[Array, "image h w c_in"], gradient: Float[Array, "image h w c_out"]
+) -> Float[Array, "3 3 c_in c_out"]:
+    """Return the gradient of the plain kernel from that of the result, `x` being what was convolved."""
+    image, h, w, c_out = gradient.shape
+    rows, columns = -(-h // 2), -(-w // 2)
+    whole = ((0, 0), (0, 2 * rows - h), (0, 2 * columns - w), (0, 0))
+    pixels = jnp.pad(jax.lax.optimization_barrier(gradient), whole)
+    pixels = pixels.reshape(image, rows, 2, columns, 2, c_out)
+    by_row = _spread(pixels[:, :, 0], pixels[:, :, 1])
+    spread = [_spread(row[..., 0, :], row[..., 1, :]) for row in by_row]
+    products = [
+        [_over_tiles(place, slope) for place, slope in zip(row, slopes, strict=True)]
+        for row, slopes in zip(_places_of_tiles(x), spread, strict=True)
+    ]
+    G = jnp.asarray(_G, x.dtype)
+    stacked = jnp.stack([jnp.stack(row) for row in products])
+    return jnp.einsum("ai,bj,abcd->ijcd", G, G, stacked, precision=jax.lax.Precision.HIGHEST)
+
+
+def _over_tiles(a: Float[Array, "*tile c"], b: Float[Array, "*tile d"]) -> Float[Array, "c d"]:
+    return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
+
+
+def _places_of_tiles(x: Float[Array, "image h w c"]) -> list[tuple[Array, Array, Array, Array]]:
+    """Return B^T d B of all tiles, by row and column of the place in a tile."""
+    image, h, w, c = x.shape
+    rows, columns = -(-h // 2), -(-w // 2)
+    # Else what `x` is computed from would be computed anew for every place of a tile.
+    x = jax.lax.optimization_barrier(x)
+    around = ((0, 0), (1, 2 * rows - h + 1), (1, 2 * columns - w + 1), (0, 0))
+    pairs = jnp.pad(x, around).reshape(image, rows + 1, 2, columns + 1, 2, c)
+    by_row = _into_tiles(pairs[:, :, 0], pairs[:, :, 1], axis=1)
+    return [_into_tiles(row[..., 0, :], row[..., 1, :], axis=2) for row in by_row]
 
 
 def _into_tiles(even: Array, odd: Array, axis: int) -> tuple[Array, Array, Array, Array]:
@@ -58,3 +91,8 @@ def _into_tiles(even: Array, odd: Array, axis: int) -> tuple[Array, Array, Array
 def _out_of_tiles(m: Sequence[Array]) -> tuple[Array, Array]:
     """Return A^T m along one axis, of which the four places are given."""
     return m[0] + m[1] + m[2], m[1] - m[2] - m[3]
+
+
+def _spread(first: Array, second: Array) -> tuple[Array, Array, Array, Array]:
+    """Return A m along one axis, of which the two pixels are given."""
+    return first, first + second, first - second, -second

@@ -68,3 +68,37 @@ def test_wide_convolutions_of_large_maps_are_prepared(c_in, c_out, size, stride,
     conv.prepare_for_cpu(pixels)
     assert (conv.kernel[...].shape != shape) == changes
     np.testing.assert_allclose(conv(x), before, atol=2e-5)
+
+
+@pytest.mark.parametrize("hw", [(8, 6), (7, 9), (1, 2), (3, 1)])
+def test_the_gradient_of_the_kernel_is_that_of_the_convolution(hw):
+    with jax.enable_x64(True):
+        x, slope = drawn((2, *hw, 5)), drawn((2, *hw, 4), 1)
+        _, pull = jax.vjp(lambda kernel: plain(x, kernel), drawn((3, 3, 5, 4), 2))
+        np.testing.assert_allclose(winograd.kernel_gradient(x, slope), pull(slope)[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("c_in", "c_out", "size", "stride", "hw", "has_own"),
+    [
+        (32, 48, 3, 1, (16, 12), True),
+        (32, 48, 3, 2, (16, 12), False),
+        (32, 48, 1, 1, (16, 12), False),
+        (16, 48, 3, 1, (16, 12), False),
+        (32, 192, 3, 1, (16, 12), False),
+    ],
+)
+def test_training_has_the_gradients_of_inference(c_in, c_out, size, stride, hw, has_own):
+    conv = Conv(c_in, c_out, size, stride, bias=True, rngs=nnx.Rngs(0))
+    graph, state = nnx.split(conv)
+
+    def loss(state, x, training):
+        return jnp.sum(nnx.merge(graph, state)(x, training=training) ** 3)
+
+    with jax.enable_x64(True):
+        x = drawn((3, *hw, c_in))
+        state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), state)
+        plain_ones, own = (jax.grad(loss, (0, 1))(state, x, training) for training in (False, True))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), own, plain_ones)
+        text = str(jax.make_jaxpr(jax.grad(loss), static_argnums=2)(state, x, True))
+    assert ("optimization_barrier" in text) == has_own
