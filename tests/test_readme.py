@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from poem_jax import preset
+from poem_jax.models.poem_v1_config import one_stage
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -57,9 +58,14 @@ def test_the_code_of_the_readme_runs_anywhere_and_reconstructs_a_hand(tmp_path) 
     assert 0 < float(error) < 30
 
 
-def test_the_experiment_of_the_models_page_can_be_made() -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
+def test_the_code_of_the_models_page_makes_an_experiment_and_a_mean_root() -> None:
+    page = (ROOT / "docs" / "models.md").read_text()
+    experiment, mean = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     names: dict = {}
-    exec(compile(code, "docs/models.md", "exec"), names)
+    exec(compile(experiment, "docs/models.md", "exec"), names)
     assert names["config"].model == preset("v1")
     assert names["config"].loss.name == "v1"
+    assert "range(100)" in mean
+    exec(compile(mean.replace("range(100)", "range(1)"), "docs/models.md", "exec"), names)
+    assert 0.3 < names["origin"][2] < 1.5
+    assert names["model"] == one_stage(names["origin"])

@@ -185,7 +185,7 @@ def test_new_masks_compile_nothing(micro_config, make_params, make_scene, monkey
 def test_transformed_kernels_change_nothing(micro_config, make_params, make_scene, monkeypatch):
     """In float64; so few channels are not transformed unless told so, and never on an accelerator."""
     monkeypatch.setattr(layers, "_FILTERED_CHANNELS", range(1, 999))
-    monkeypatch.setattr(layers, "_FILTERED_PIXELS", 1)
+    monkeypatch.setattr(layers, "_FILTERED_SIZE", 1)
     views, cams = make_scene(2, 3)
     with jax.enable_x64(True):
         params = in_float64(make_params(micro_config))

@@ -53,12 +53,13 @@ def test_kernels_of_a_row_of_blocks_are_transformed_one_by_one():
 @pytest.mark.parametrize(
     ("c_in", "c_out", "size", "stride", "pixels", "changes"),
     [
-        (64, 96, 3, 1, 256, True),
-        (64, 64, 3, 2, 256, False),
-        (64, 64, 1, 1, 256, False),
-        (24, 64, 3, 1, 256, False),
-        (512, 64, 3, 1, 256, False),
-        (64, 96, 3, 1, 64, False),
+        (64, 96, 3, 1, 512, True),
+        (160, 160, 3, 1, 256, True),
+        (64, 64, 3, 2, 512, False),
+        (64, 64, 1, 1, 512, False),
+        (24, 64, 3, 1, 4096, False),
+        (512, 64, 3, 1, 512, False),
+        (64, 96, 3, 1, 256, False),
     ],
 )
 def test_wide_convolutions_of_large_maps_are_prepared(c_in, c_out, size, stride, pixels, changes):
