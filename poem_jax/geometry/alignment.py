@@ -74,7 +74,7 @@ def nearest_rotation(
     repeat; where R is not determined (rank 1 or less) the undetermined part has zero derivative.
     """
     if array_namespace(M) is np:
-        return _orthogonal(np, M, allow_reflection)[0]
+        return _orthogonal(np.linalg.svd(M, full_matrices=False), allow_reflection)[0]
     return _differentiable_rotation()(M, allow_reflection)
 
 
@@ -96,13 +96,14 @@ def _scale(R: Array, M: Array, X: Array, norm_epsilon: float) -> Array:
     return xp.where(empty, xp.zeros_like(trace), trace / xp.where(empty, xp.ones_like(norm), norm) ** 2)
 
 
-def _orthogonal(xp: Any, M: Array, allow_reflection: bool) -> tuple[Array, Array, Array]:
+def _orthogonal(parts: tuple[Array, Array, Array], allow_reflection: bool) -> tuple[Array, Array, Array]:
     """Return R, V^T and the signed singular values, the last of them negated where a reflection was
-    undone."""
-    U, S, Vt = xp.linalg.svd(M, full_matrices=False)
+    undone, from the parts U, S, V^T of a matrix."""
+    U, S, Vt = parts
     if not allow_reflection:
-        sign = xp.where(xp.linalg.det(matmul(U, Vt)) < 0, -1, 1).astype(M.dtype)
-        last = xp.asarray([0, 0, 1], dtype=M.dtype)
+        xp = array_namespace(U)
+        sign = xp.where(xp.linalg.det(matmul(U, Vt)) < 0, -1, 1).astype(U.dtype)
+        last = xp.asarray([0, 0, 1], dtype=U.dtype)
         signs = 1 + (sign[..., None] - 1) * last
         U, S = U * signs[..., None, :], S * signs
     return matmul(U, Vt), Vt, S
@@ -112,15 +113,16 @@ def _orthogonal(xp: Any, M: Array, allow_reflection: bool) -> tuple[Array, Array
 def _differentiable_rotation() -> Any:
     """Build the JAX form of `_orthogonal` with its own derivative; JAX is imported only here."""
     import jax
-    import jax.numpy as jnp
+
+    from poem_jax.geometry.singular_values import svd
 
     @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
     def rotation(M: Array, allow_reflection: bool) -> Array:
-        return _orthogonal(jnp, M, allow_reflection)[0]
+        return _orthogonal(svd(M), allow_reflection)[0]
 
     @rotation.defjvp
     def rotation_jvp(allow_reflection: bool, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        R, Vt, S = _orthogonal(jnp, primals[0], allow_reflection)
+        R, Vt, S = _orthogonal(svd(primals[0]), allow_reflection)
         return R, _rotation_tangent(R, Vt, S, tangents[0])
 
     return rotation

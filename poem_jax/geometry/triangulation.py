@@ -9,6 +9,7 @@ useful down to baselines of 0.1 mm.
 import jax
 import jax.numpy as jnp
 
+from poem_jax.geometry.singular_values import svd
 from poem_jax.geometry.transforms import invert_rigid, matmul, unit_vectors
 from poem_jax.typing import Array, Bool, Float
 
@@ -72,14 +73,14 @@ def null_vector(
     s_4 enter, dx = sum_i v_i (s_4 u_4 . dA v_i + s_i u_i . dA x) / (s_4^2 - s_i^2), i < 4; where a gap
     vanishes the term is dropped, so that the derivative is finite always. First derivatives only.
     """
-    _, singular, Vt = jnp.linalg.svd(A, full_matrices=False)
+    _, singular, Vt = svd(A)
     return Vt[..., 3, :], singular
 
 
 @null_vector.defjvp
 def _null_vector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
     (A,), (dA,) = primals, tangents
-    U, s, Vt = jnp.linalg.svd(A, full_matrices=False)
+    U, s, Vt = svd(A)
     u4, s4, x = U[..., :, 3:], s[..., 3:], Vt[..., 3, :]
     left = matmul(jnp.swapaxes(U, -1, -2), matmul(dA, x[..., None]))[..., 0]
     right = matmul(matmul(Vt, jnp.swapaxes(dA, -1, -2)), u4)[..., 0]
