@@ -118,6 +118,8 @@ _FILTERED_CHANNELS, _FILTERED_SIZE = range(40, 257), 2**15
 fewer channels no matrix product is filled, of more the kernel, which grows, takes most of the time to read;
 on smaller maps (64 channels on 16 x 16) both are equally fast."""
 _LEAST_GRADIENT_CHANNELS = 32
+"""Where minimal filtering is the faster gradient of a kernel on a CPU (docs/performance.md, "A training
+step"): from so many channels on, and where there are at least as many tiles as channels."""
 
 
 class Conv(nnx.Module):
@@ -133,7 +135,8 @@ class Conv(nnx.Module):
     def __call__(
         self, x: Float[Array, "image h w c"], *, training: bool = False
     ) -> Float[Array, "image h2 w2 c2"]:
-        """Convolve. In `training` gradients may have a form of their own, which knows no forward mode."""
+        """Convolve. In `training` gradients may have a form of their own, which knows no forward mode and, in
+        a `shard_map`, wants `check_vma=False`."""
         y = self._pointwise(x) if self.size == 1 else self._windowed(x, training)
         return y if self.bias is None else y + self.bias[...]
 
@@ -175,7 +178,7 @@ def convolve(
 
 
 def _filters_gradients(x: Array, kernel: Array) -> bool:
-    """Whether minimal filtering is the faster gradient of a kernel on a CPU: for products that are filled."""
+    """Whether minimal filtering is the faster gradient of a kernel on a CPU."""
     channels, tiles = kernel.shape[-2:], x.size // x.shape[-1] // 4
     return min(channels) >= _LEAST_GRADIENT_CHANNELS and tiles >= max(channels)
 
@@ -192,12 +195,16 @@ def _trained_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array
 
 def _trained_backward(kept: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, kernel = kept
-
-    def plain(x: Array, gradient: Array) -> Array:
-        return jax.vjp(lambda kernel: convolve(x, kernel), kernel)[1](gradient)[0]
-
-    of_kernel = jax.lax.platform_dependent(x, gradient, cpu=winograd.kernel_gradient, default=plain)
+    of_kernel = jax.lax.platform_dependent(
+        x, gradient, cpu=winograd.kernel_gradient, default=_plain_kernel_gradient
+    )
     return jax.vjp(lambda x: convolve(x, kernel), x)[1](gradient)[0], of_kernel
+
+
+def _plain_kernel_gradient(x: Array, gradient: Array) -> Array:
+    """Return the gradient of a 3 x 3 kernel as the compiler has it."""
+    kernel = jnp.zeros((3, 3, x.shape[-1], gradient.shape[-1]), x.dtype)
+    return jax.vjp(lambda kernel: convolve(x, kernel), kernel)[1](gradient)[0]
 
 
 _trained_convolution.defvjp(_trained_forward, _trained_backward)

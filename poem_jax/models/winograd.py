@@ -59,13 +59,16 @@ def kernel_gradient(
         [_over_tiles(place, slope) for place, slope in zip(row, slopes, strict=True)]
         for row, slopes in zip(_places_of_tiles(x), spread, strict=True)
     ]
-    G = jnp.asarray(_G, x.dtype)
     stacked = jnp.stack([jnp.stack(row) for row in products])
-    return jnp.einsum("ai,bj,abcd->ijcd", G, G, stacked, precision=jax.lax.Precision.HIGHEST)
+    G = jnp.asarray(_G, stacked.dtype)
+    found = jnp.einsum("ai,bj,abcd->ijcd", G, G, stacked, precision=jax.lax.Precision.HIGHEST)
+    return found.astype(x.dtype)
 
 
 def _over_tiles(a: Float[Array, "*tile c"], b: Float[Array, "*tile d"]) -> Float[Array, "c d"]:
-    return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
+    """Sum products over the tiles, in float32 at least: of half numbers the sum would lose its digits."""
+    kept = jnp.promote_types(a.dtype, jnp.float32)
+    return jnp.matmul(a.reshape(-1, a.shape[-1]).T, b.reshape(-1, b.shape[-1]), preferred_element_type=kept)
 
 
 def _places_of_tiles(x: Float[Array, "image h w c"]) -> list[tuple[Array, Array, Array, Array]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from poem_jax.models import winograd
+from poem_jax.models import layers, winograd
 from poem_jax.models.layers import Conv
 
 
@@ -103,3 +103,33 @@ def test_training_has_the_gradients_of_inference(c_in, c_out, size, stride, hw, 
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), own, plain_ones)
         text = str(jax.make_jaxpr(jax.grad(loss), static_argnums=2)(state, x, True))
     assert ("optimization_barrier" in text) == has_own
+
+
+@pytest.mark.parametrize(("platform", "is_filtered"), [("cpu", True), ("cuda", False)])
+def test_accelerators_keep_the_gradients_of_their_compiler(platform, is_filtered):
+    conv = Conv(32, 48, 3, rngs=nnx.Rngs(0))
+    graph, state = nnx.split(conv)
+
+    def loss(state, x):
+        return jnp.sum(nnx.merge(graph, state)(x, training=True) ** 3)
+
+    x = jnp.ones((3, 16, 12, 32))
+    text = jax.jit(jax.grad(loss)).trace(state, x).lower(lowering_platforms=(platform,)).as_text()
+    assert ("optimization_barrier" in text) == is_filtered
+
+
+def test_the_gradients_of_an_accelerator_are_the_same():
+    x, slope = drawn((2, 6, 5, 3)).astype(jnp.float32), drawn((2, 6, 5, 4), 1).astype(jnp.float32)
+    np.testing.assert_allclose(
+        layers._plain_kernel_gradient(x, slope), winograd.kernel_gradient(x, slope), atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_sums_over_many_tiles_keep_their_digits(dtype):
+    """Rounding the inputs is all that half numbers lose: the sums are of float32."""
+    x, slope = (drawn((8, 32, 32, 32), seed).astype(dtype) for seed in range(2))
+    with jax.enable_x64(True):
+        exact = np.asarray(winograd.kernel_gradient(x.astype(jnp.float64), slope.astype(jnp.float64)))
+    error = np.abs(np.asarray(winograd.kernel_gradient(x, slope), np.float64) - exact).max()
+    assert error / np.abs(exact).max() < (2e-6 if dtype == jnp.float32 else 2e-2)
