@@ -26,6 +26,26 @@ MAX_LAYERS = 256
 """Of layers, blocks or modules in a row; the largest model has 9."""
 
 
+def require_images(config: "ModelConfig", strides: tuple[int, ...]) -> None:
+    """Insist on images that a trunk of these strides can take, and on a mean and a spread of their pixels.
+
+    Raises:
+        ValueError: names the field.
+    """
+    require(
+        isinstance(config.image_hw, tuple) and len(config.image_hw) == 2,
+        f"`image_hw` must be (height, width); got {config.image_hw}",
+    )
+    require(
+        math.isfinite(config.image_mean) and 0 < config.image_std < math.inf,
+        f"`image_mean` must be finite and `image_std` positive; got {config.image_mean}, {config.image_std}",
+    )
+    require(
+        all(size % strides[-1] == 0 for size in config.image_hw),
+        f"`image_hw` must be multiples of the trunk's coarsest stride {strides[-1]}; got {config.image_hw}",
+    )
+
+
 def require_counts(owner: Any, *names: str, most: int = MAX_COUNT) -> None:
     """Insist that fields are whole numbers from 1 to `most`, or tuples of at most `MAX_LAYERS` of them."""
     for name in names:
@@ -458,19 +478,7 @@ class Config(ModelConfig):
 
     def __post_init__(self) -> None:
         require_counts(self, "image_hw", "width")
-        require(
-            isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
-            f"`image_hw` must be (height, width); got {self.image_hw}",
-        )
-        require(
-            math.isfinite(self.image_mean) and 0 < self.image_std < math.inf,
-            f"`image_mean` must be finite and `image_std` positive; got {self.image_mean}, {self.image_std}",
-        )
-        coarsest = self.backbone.strides[-1]
-        require(
-            all(size % coarsest == 0 for size in self.image_hw),
-            f"`image_hw` must be multiples of the trunk's coarsest stride {coarsest}; got {self.image_hw}",
-        )
+        require_images(self, self.backbone.strides)
         strides = self.backbone.strides
         for name, stride in (
             ("features.stride", self.features.stride),

@@ -1,7 +1,6 @@
 """Configuration of the mesh transformers, PE-MeshTR and FTL-MeshTR (`mesh_transformers.py`), and the released
 ones."""
 
-import math
 from dataclasses import dataclass, field, replace
 
 from poem_jax.hand.topology import QueryOrder
@@ -13,6 +12,7 @@ from poem_jax.models.config import (
     ResNetConfig,
     require,
     require_counts,
+    require_images,
 )
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import (
@@ -70,19 +70,8 @@ class MeshTransformerConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         require_counts(self, "image_hw", "width", "stride")
-        require(
-            isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
-            f"`image_hw` must be (height, width); got {self.image_hw}",
-        )
-        require(
-            math.isfinite(self.image_mean) and 0 < self.image_std < math.inf,
-            f"`image_mean` must be finite and `image_std` positive; got {self.image_mean}, {self.image_std}",
-        )
         strides = self.backbone.strides
-        require(
-            all(size % strides[-1] == 0 for size in self.image_hw),
-            f"`image_hw` must be multiples of the trunk's coarsest stride {strides[-1]}; got {self.image_hw}",
-        )
+        require_images(self, strides)
         require(
             self.stride in strides,
             f"`stride` must be one of the trunk's strides {strides}; got {self.stride}",

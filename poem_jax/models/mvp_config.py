@@ -1,6 +1,5 @@
 """Configuration of MvP, the baseline of the paper's main experiments (`mvp.py`)."""
 
-import math
 from dataclasses import dataclass, field
 
 from poem_jax.hand.topology import QueryOrder
@@ -12,6 +11,7 @@ from poem_jax.models.config import (
     ResNetConfig,
     require,
     require_counts,
+    require_images,
 )
 from poem_jax.models.frustum_config import DEXYCB_CUBOID, Cuboid
 
@@ -58,22 +58,11 @@ class MvpConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         require_counts(self, "num_views", "image_hw", "width")
-        require(
-            isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
-            f"`image_hw` must be (height, width); got {self.image_hw}",
-        )
-        require(
-            math.isfinite(self.image_mean) and 0 < self.image_std < math.inf,
-            f"`image_mean` must be finite and `image_std` positive; got {self.image_mean}, {self.image_std}",
-        )
         strides = self.backbone.strides
+        require_images(self, strides)
         require(
             len(strides) >= NUM_LEVELS,
             f"`backbone` must have at least {NUM_LEVELS} stages, whose maps are read; got {len(strides)}",
-        )
-        require(
-            all(size % strides[-1] == 0 for size in self.image_hw),
-            f"`image_hw` must be multiples of the trunk's coarsest stride {strides[-1]}; got {self.image_hw}",
         )
         require(
             self.design is Design.PAPER or min(self.image_hw) > strides[-1],

@@ -21,6 +21,7 @@ from poem_jax.models.config import (
     RootConfig,
     require,
     require_counts,
+    require_images,
 )
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import DEXYCB_CUBOID, Cuboid, DepthSteps, FrustumConfig
@@ -158,19 +159,7 @@ class PoemV1Config(ModelConfig):
 
     def __post_init__(self) -> None:
         require_counts(self, "image_hw", "width")
-        require(
-            isinstance(self.image_hw, tuple) and len(self.image_hw) == 2,
-            f"`image_hw` must be (height, width); got {self.image_hw}",
-        )
-        require(
-            math.isfinite(self.image_mean) and 0 < self.image_std < math.inf,
-            f"`image_mean` must be finite and `image_std` positive; got {self.image_mean}, {self.image_std}",
-        )
-        coarsest = self.backbone.strides[-1]
-        require(
-            all(size % coarsest == 0 for size in self.image_hw),
-            f"`image_hw` must be multiples of the trunk's coarsest stride {coarsest}; got {self.image_hw}",
-        )
+        require_images(self, self.backbone.strides)
         self._check_first_stage()
         self._check_second_stage()
 

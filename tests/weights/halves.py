@@ -2,9 +2,7 @@
 
 import functools
 import itertools
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,6 +19,7 @@ from poem_jax.models.network import assemble
 from poem_jax.models.poem_v2 import ViewFeatures
 from poem_jax.models.world_frame import WorkingFrame
 from poem_jax.typing import Array, Params
+from tests.weights.listening import Ears, listening
 
 
 def _whole(args: tuple, out: Any) -> Any:
@@ -31,7 +30,7 @@ def _rows40(args: tuple, out: Any) -> Any:
     return out[:, ::40]
 
 
-HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
+HEARD: Ears = {
     "levels": (HRNet, "__call__", _whole),
     "mlvl_feat": (point_features.BottomUpBranch, "__call__", _whole),
     "input_proj": (point_features.FeatureBranch, "__call__", _whole),
@@ -55,29 +54,11 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
 """What is kept of every call of a function or method, in the order of the calls."""
 
 
-@contextmanager
-def listening() -> Iterator[dict[str, list]]:
-    heard: dict[str, list] = defaultdict(list)
-
-    def with_ear(name: str, function: Callable, pick: Callable) -> Callable:
-        def call(*args: Any, **options: Any) -> Any:
-            out = function(*args, **options)
-            heard[name].append(pick(args, out))
-            return out
-
-        return call
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name, (owner, attribute, pick) in HEARD.items():
-            patch.setattr(owner, attribute, with_ear(name, getattr(owner, attribute), pick))
-        yield heard
-
-
 @functools.partial(jax.jit, static_argnames="config")
 def look(params: Params, views: Array, *, config: Config) -> tuple[ViewFeatures, dict[str, list]]:
     """Run what is done with every view alone."""
     model = assemble(config, params)
-    with listening() as heard:
+    with listening(HEARD) as heard:
         seen = model.look(views, layers.NormMode())
     heard["uv_logits"] = [model.heat_maps.to_logits(heard["pooled"][0])]
     return seen, dict(heard)
@@ -92,7 +73,7 @@ def find_hands(
     Returns: the prediction, how much farther the 33rd is (squared, units of 10 cm), and what was heard.
     """
     model, gaps = assemble(config, params), []
-    with listening() as heard, pytest.MonkeyPatch.context() as patch:
+    with listening(HEARD) as heard, pytest.MonkeyPatch.context() as patch:
         patch.setattr(vector_attention, "nearest", nearest_but_for(swapped, gaps))
         prediction = model.find_hands(seen, frame, layers.NormMode())
     return prediction, jnp.stack(gaps), dict(heard)

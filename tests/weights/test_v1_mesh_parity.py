@@ -5,10 +5,8 @@ from them.
 """
 
 import functools
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -16,7 +14,6 @@ import pytest
 from flax import nnx
 
 from poem_jax.batch import MultiViewBatch, Prediction
-from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import joints_from_vertices, template_queries
 from poem_jax.hand.topology import WRIST, split_queries
 from poem_jax.models import mesh_transformers
@@ -27,7 +24,9 @@ from poem_jax.models.mesh_transformers import CoarsestFeatures, MeshTransformer,
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array
 from poem_jax.weights.v1_mesh_keys import aliases, hand_prefixes, unused_shapes, used_rows
+from tests.weights.listening import Ears, Heard, listening
 from tests.weights.v1_procedural import (
+    amid_garbage,
     batch_of,
     golden,
     hand,
@@ -94,9 +93,7 @@ def test_the_first_name_of_an_array_has_the_value_of_all(name: str) -> None:
 
 # Outputs and stages.
 
-Heard = dict[str, list[Any]]
-
-HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
+HEARD: Ears = {
     "features": (CoarsestFeatures, "__call__", lambda args, out: (args[1][-1], out)),
     "converted": (mesh_transformers, "_per_image", lambda args, out: (args[1], out)),
     "encoded": (PointwiseNetwork, "__call__", lambda args, out: (args[1], out)),
@@ -104,24 +101,6 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
     "template_queries": (mesh_transformers, "template_queries", lambda args, out: out),
 }
 """What is kept of every call of a function or method, in the order of the calls."""
-
-
-@contextmanager
-def listening() -> Iterator[Heard]:
-    heard: Heard = defaultdict(list)
-
-    def with_ear(name: str, function: Callable, pick: Callable) -> Callable:
-        def call(*args: Any, **options: Any) -> Any:
-            out = function(*args, **options)
-            heard[name].append(pick(args, out))
-            return out
-
-        return call
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name, (owner, attribute, pick) in HEARD.items():
-            patch.setattr(owner, attribute, with_ear(name, getattr(owner, attribute), pick))
-        yield heard
 
 
 class Run(NamedTuple):
@@ -138,7 +117,7 @@ def released(name: str) -> MeshTransformer:
 
 @nnx.jit
 def _run(model: MeshTransformer, views: Array, frame: WorkingFrame) -> tuple[Prediction, Heard]:
-    with listening() as heard:
+    with listening(HEARD) as heard:
         prediction = model.find_hands(model.look(views, NormMode()), frame, NormMode())
     return prediction, dict(heard)
 
@@ -277,19 +256,6 @@ def test_every_stored_array_is_compared(case: Case) -> None:
 
 
 # Masks.
-
-PLACES = (1, 2, 4, 7)
-"""Where the four views of set a stand among 8; the others hold garbage."""
-
-
-def amid_garbage(batch: MultiViewBatch) -> MultiViewBatch:
-    rng, shape = np.random.default_rng(0), (len(batch.views), 8)
-    views = rng.integers(0, 256, (*shape, *batch.views.shape[2:]), np.uint8)
-    K, T = np.full((*shape, 3, 3), np.nan, np.float32), rng.normal(size=(*shape, 4, 4))
-    mask, places = np.zeros(shape, bool), list(PLACES)
-    views[:, places], mask[:, places] = batch.views, True
-    K[:, places], T[:, places] = batch.cameras.K, batch.cameras.T_cam_from_world
-    return batch._replace(views=views, cameras=Cameras(K, T, mask))
 
 
 @pytest.mark.parity

@@ -6,9 +6,7 @@ There are no searches in MvP, so that no ties can turn: float32 meets float32 at
 
 import functools
 import json
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -29,6 +27,7 @@ from poem_jax.models.mvp_config import MvpConfig
 from poem_jax.models.network import Draw, reconstruct
 from poem_jax.models.world_frame import enter_working_frame
 from poem_jax.weights.v1_mvp_keys import constant_rows, hand_prefixes, unused_shapes, used_rows
+from tests.weights.listening import Ears, listening
 from tests.weights.procedural import in_float32
 from tests.weights.v1_procedural import (
     REFERENCE_V1,
@@ -109,7 +108,7 @@ class Run(NamedTuple):
     """What parts of it were given and gave, call by call."""
 
 
-HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
+HEARD: Ears = {
     "queries": (mvp.ReleaseQueries, "__call__", lambda args, out: (args[1], *out)),
     "scene": (mvp, "view_scene", lambda args, out: (out.levels, out.rays)),
     "self_attention": (mvp.MultiHeadAttention, "__call__", lambda args, out: out),
@@ -124,24 +123,6 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
 """What is kept of every call of a function or method."""
 
 
-@contextmanager
-def listening() -> Iterator[dict[str, list]]:
-    heard: dict[str, list] = defaultdict(list)
-
-    def with_ear(name: str, function: Callable, pick: Callable) -> Callable:
-        def call(*args: Any, **options: Any) -> Any:
-            out = function(*args, **options)
-            heard[name].append(pick(args, out))
-            return out
-
-        return call
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name, (owner, attribute, pick) in HEARD.items():
-            patch.setattr(owner, attribute, with_ear(name, getattr(owner, attribute), pick))
-        yield heard
-
-
 @functools.cache
 def run(model: str) -> Run:
     made, batch = released(model), batch_of(CASES[model])
@@ -151,7 +132,7 @@ def run(model: str) -> Run:
     @jax.jit
     def predict(state: Any, views: Any, frame: Any) -> tuple[Prediction, dict]:
         model = nnx.merge(graph, state)
-        with listening() as heard:
+        with listening(HEARD) as heard:
             prediction = reconstruct(model, views, frame, NormMode(), Draw())
         heard["global"] = [model.queries.mix(heard["queries"][0][0])]
         return prediction, dict(heard)

@@ -10,7 +10,6 @@ them agree as those before.
 
 import functools
 import itertools
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -48,8 +47,11 @@ from poem_jax.models.vector_attention import BracketedVectorAttention
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array
 from poem_jax.weights.v1_poem_keys import hand_prefixes, unused_shapes, used_rows
+from tests.weights.listening import Ears, Heard, listening
 from tests.weights.procedural import in_float32
 from tests.weights.v1_procedural import (
+    PLACES,
+    amid_garbage,
     batch_of,
     golden,
     hand,
@@ -129,14 +131,12 @@ def test_the_tables_are_the_manifest(name: str) -> None:
 
 # Runs.
 
-Heard = dict[str, list[Any]]
-
 
 def _whole(args: tuple, out: Any) -> Any:
     return out
 
 
-HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
+HEARD: Ears = {
     "levels": (ResNet, "__call__", _whole),
     "uv_pooled": (heat_maps, "max_pool", _whole),
     "feat_pooled": (poem_v1_release, "max_pool", _whole),
@@ -153,24 +153,6 @@ HEARD: dict[str, tuple[Any, str, Callable[[tuple, Any], Any]]] = {
     "searched": (vector_attention, "nearest", lambda args, out: (*args[:2], out)),
 }
 """What is kept of every call of a function or method, in the order of the calls."""
-
-
-@contextmanager
-def listening() -> Iterator[Heard]:
-    heard: Heard = defaultdict(list)
-
-    def with_ear(name: str, function: Callable, pick: Callable) -> Callable:
-        def call(*args: Any, **options: Any) -> Any:
-            out = function(*args, **options)
-            heard[name].append(pick(args, out))
-            return out
-
-        return call
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name, (owner, attribute, pick) in HEARD.items():
-            patch.setattr(owner, attribute, with_ear(name, getattr(owner, attribute), pick))
-        yield heard
 
 
 @contextmanager
@@ -209,7 +191,7 @@ def _run(model: PoemV1, views: Array, frame: WorkingFrame, ball_index: Array) ->
 def _run_heard(
     model: PoemV1, views: Array, frame: WorkingFrame, ball_index: Array, lists: list[Array | None]
 ) -> tuple[Prediction, Heard]:
-    with neighbours_given(lists), listening() as heard:
+    with neighbours_given(lists), listening(HEARD) as heard:
         prediction = model.find_hands(model.look(views, NormMode()), frame, NormMode(), ball_index=ball_index)
     second, start = model.second, model.start
     queries = heard["start"][0].queries
@@ -515,19 +497,6 @@ def test_every_stored_array_is_compared(case: Case) -> None:
 
 
 # Masks.
-
-PLACES = (1, 2, 4, 7)
-"""Where the four views of set a stand among 8; the others hold garbage."""
-
-
-def amid_garbage(batch: MultiViewBatch) -> MultiViewBatch:
-    rng, shape = np.random.default_rng(0), (len(batch.views), 8)
-    views = rng.integers(0, 256, (*shape, *batch.views.shape[2:]), np.uint8)
-    K, T = np.full((*shape, 3, 3), np.nan, np.float32), rng.normal(size=(*shape, 4, 4))
-    mask, places = np.zeros(shape, bool), list(PLACES)
-    views[:, places], mask[:, places] = batch.views, True
-    K[:, places], T[:, places] = batch.cameras.K, batch.cameras.T_cam_from_world
-    return batch._replace(views=views, cameras=Cameras(K, T, mask))
 
 
 @pytest.mark.parity

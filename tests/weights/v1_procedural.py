@@ -196,3 +196,18 @@ def load_rows(model: nnx.Module, rows: list[NameRow], state: dict[str, np.ndarra
 
 def _key(part: str) -> str | int:
     return int(part) if part.isdigit() else part
+
+
+PLACES = (1, 2, 4, 7)
+"""Where the four views of set a stand among 8; the others hold garbage."""
+
+
+def amid_garbage(batch: MultiViewBatch) -> MultiViewBatch:
+    """Put the four views of a batch at `PLACES` among 8 of which the others are masked."""
+    rng, shape = np.random.default_rng(0), (len(batch.views), 8)
+    views = rng.integers(0, 256, (*shape, *batch.views.shape[2:]), np.uint8)
+    K, T = np.full((*shape, 3, 3), np.nan, np.float32), rng.normal(size=(*shape, 4, 4))
+    mask, places = np.zeros(shape, bool), list(PLACES)
+    views[:, places], mask[:, places] = batch.views, True
+    K[:, places], T[:, places] = batch.cameras.K, batch.cameras.T_cam_from_world
+    return batch._replace(views=views, cameras=Cameras(K, T, mask))
