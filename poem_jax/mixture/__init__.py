@@ -1,0 +1,1 @@
+"""Sources mixed: which sample a step sees, read and augmented in worker processes."""
