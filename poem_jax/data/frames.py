@@ -75,6 +75,10 @@ class MultiViewFrame(NamedTuple):
     shows: everything here (K, extrinsics, labels) is that of the mirrored hand already, and each stored image
     must still be turned left to right about the column u = mirror_px, u' = 2 mirror_px - u, where
     mirror_px = cx keeps K."""
+    dist: Float[Array, "view term"] | None = None
+    """Lens of the stored images, the 5 or 8 terms of `geometry.distortion`, as calibrated (not mirrored);
+    None: they have no distortion. K, key points and boxes are those of the ideal image that the same K would
+    see without it: crops are sampled through the lens (`data/lens.py`)."""
 
 
 class FrameSource(Protocol):
@@ -128,6 +132,12 @@ def _problems(frame: MultiViewFrame) -> Iterator[str]:
         bad = ~np.isfinite(np.asarray(value, np.float64)).reshape(views, -1).all(-1)
         if bad.any():
             yield f"`{name}` is not finite in {_views(frame, bad)}"
+    if frame.dist is not None:
+        terms = np.asarray(frame.dist, np.float64)
+        if terms.shape not in ((views, 5), (views, 8)):
+            yield f"`dist` must have shape {(views, 5)} or {(views, 8)} for {views} images; got {terms.shape}"
+        elif not np.isfinite(terms).all():
+            yield f"`dist` is not finite in {_views(frame, ~np.isfinite(terms).all(-1))}"
     if len(frame.view_names) != views:
         yield f"it has {len(frame.view_names)} names of views for {views} images"
         return
