@@ -26,7 +26,7 @@ import numpy as np
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.capture.detect import detect_hands
-from poem_jax.capture.folder import find_frames, find_rig
+from poem_jax.data.capture_folder import find_frames, find_rig
 from poem_jax.fitting import FitConfig, FitResult, KeypointNoise, Observations, fit_take, keypoint_model
 from poem_jax.fitting.detector_offsets import DETECTORS, MEDIAPIPE_HANDS, KeypointOffsets
 from poem_jax.geometry.cameras import project

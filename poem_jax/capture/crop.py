@@ -6,7 +6,7 @@ import numpy as np
 
 from poem_jax.capture.boxes_file import boxes_from_keypoints
 from poem_jax.capture.frame import Frame, HandCrops
-from poem_jax.capture.lens import picture_map, take_picture
+from poem_jax.data.lens import picture_map, take_picture
 from poem_jax.data.transforms import square_box
 from poem_jax.geometry.cameras import crop_intrinsics, normalised_from_pixels, roll
 from poem_jax.geometry.distortion import undistort_pixels

@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from poem_jax.capture.association import AssociatedHands, associate_hands
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
-from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.read import image_of_camera
+from poem_jax.data.capture_folder import FramePaths
 from poem_jax.detection import DetectedHand, HandTracker, find_hands
 from poem_jax.fitting.detector_offsets import MEDIAPIPE_HANDS
 from poem_jax.geometry.rig import Rig

@@ -8,7 +8,7 @@ import numpy as np
 
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.lens import project_raw
+from poem_jax.data.lens import project_raw
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT
 from poem_jax.typing import Array, Bool, Float

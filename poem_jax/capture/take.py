@@ -15,8 +15,8 @@ from poem_jax.capture.boxes_file import (
     read_boxes,
     without_boxes_outside,
 )
-from poem_jax.capture.folder import FramePaths, find_frames, find_rig
 from poem_jax.capture.frame import Frame
+from poem_jax.data.capture_folder import FramePaths, find_frames, find_rig
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import safe_file_names
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from poem_jax.capture.frame import Frame
-from poem_jax.capture.lens import PictureMap, picture_map, project_raw, take_picture
 from poem_jax.capture.report import Clock, Report
 from poem_jax.capture.take import Take
+from poem_jax.data.lens import PictureMap, picture_map, project_raw, take_picture
 from poem_jax.geometry.distortion import undistort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import rigid, smallest_rotation

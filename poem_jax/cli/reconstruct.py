@@ -73,8 +73,8 @@ class Reconstruct:
 
     def _check_model_fits(self, checkpoint: Path) -> None:
         """Refuse a model for another number of cameras before a take is searched for hands."""
-        from poem_jax.capture.folder import find_rig
         from poem_jax.capture.network import check_rig
+        from poem_jax.data.capture_folder import find_rig
         from poem_jax.weights.store import read_config
 
         check_rig(read_config(checkpoint), find_rig(self.folder, self.rig))

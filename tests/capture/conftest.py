@@ -8,7 +8,7 @@ import pytest
 
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, write_boxes
-from poem_jax.capture.lens import project_raw
+from poem_jax.data.lens import project_raw
 from tests.rigs import small_rig
 
 

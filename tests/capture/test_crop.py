@@ -6,7 +6,7 @@ import pytest
 
 from poem_jax.capture.crop import crop_hands, hand_squares
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.lens import project_raw
+from poem_jax.data.lens import project_raw
 from poem_jax.geometry.cameras import project
 from poem_jax.hand.topology import ROOT_JOINT, WRIST
 from poem_jax.models.config import CropConfig

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.demo import demo_folder, ground_truth, mpvpe_mm
-from poem_jax.capture.lens import project_raw
 from poem_jax.capture.read import read_images
 from poem_jax.capture.take import read_take
+from poem_jax.data.lens import project_raw
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,9 +10,9 @@ import pytest
 from poem_jax.capture.association import associate_hands
 from poem_jax.capture.boxes_file import read_boxes
 from poem_jax.capture.demo import demo_folder
-from poem_jax.capture.folder import find_frames
 from poem_jax.capture.rig_file import read_rig
 from poem_jax.cli import main
+from poem_jax.data.capture_folder import find_frames
 from poem_jax.detection import HandTracker, find_hands
 from poem_jax.io.images import read_image
 

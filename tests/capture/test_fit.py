@@ -13,12 +13,12 @@ from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.fit import _windows, hands_of
-from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.pipeline import fit
 from poem_jax.capture.take import Take, make_take, read_keypoint_take
 from poem_jax.cli import main
+from poem_jax.data.capture_folder import FramePaths
 from poem_jax.geometry.distortion import distort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle

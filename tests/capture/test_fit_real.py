@@ -12,9 +12,9 @@ import pytest
 from poem_jax.calibration.rig_json import read_rig, write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.detect import detect_hands
-from poem_jax.capture.folder import find_frames
 from poem_jax.capture.pipeline import fit
 from poem_jax.capture.take import read_keypoint_take
+from poem_jax.data.capture_folder import find_frames
 from poem_jax.geometry.rig import HALF_PIXEL, Rig
 from poem_jax.geometry.transforms import rigid
 

@@ -7,8 +7,8 @@ import pytest
 from poem_jax.batch import Prediction
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.judge import SEVERAL, judge_hands
-from poem_jax.capture.lens import project_raw
 from poem_jax.capture.network import Network
+from poem_jax.data.lens import project_raw
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import Config

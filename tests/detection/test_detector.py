@@ -8,7 +8,7 @@ import pytest
 
 import poem_jax.capture
 from poem_jax.calibration.rig_json import read_rig
-from poem_jax.capture.lens import project_raw
+from poem_jax.data.lens import project_raw
 from poem_jax.detection import HandTracker, find_hands
 from poem_jax.detection import detector as detector_module
 from poem_jax.detection.regions import Region

@@ -10,11 +10,11 @@ import pytest
 import poem_jax.capture.fit
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, read_boxes, write_boxes
 from poem_jax.capture.fit import fit_hands, hands_of
-from poem_jax.capture.folder import FramePaths
 from poem_jax.capture.frame import HandResult
 from poem_jax.capture.judge import judge_hands
-from poem_jax.capture.lens import project_raw
 from poem_jax.capture.take import Take, make_take
+from poem_jax.data.capture_folder import FramePaths
+from poem_jax.data.lens import project_raw
 from poem_jax.fitting.detector_offsets import (
     DETECTORS,
     MEDIAPIPE_HANDS,

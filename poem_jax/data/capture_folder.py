@@ -1,0 +1,102 @@
+"""The folder of a capture: its calibration, and its images, one per camera or one folder per frame.
+
+    DIR/rig.json or DIR/calibration/rig.json
+
+    DIR/<camera>.jpg                    one frame
+    DIR/frames/<frame>/<camera>.jpg     a take
+
+`.jpg`, `.jpeg` and `.png` in either case; the images are raw: distorted, as the camera gave them. Folders
+that systems make beside one's own (`.ipynb_checkpoints`, `@eaDir`, `__MACOSX`) are no frames.
+"""
+
+import itertools
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from poem_jax.calibration.rig_json import read_rig
+from poem_jax.geometry.rig import Rig
+from poem_jax.io.file_names import name_key, safe_file_names
+
+RIG_FILES = ("rig.json", "calibration/rig.json")
+SUFFIXES = (".jpg", ".jpeg", ".png")
+SINGLE_FRAME = "0000"
+"""Name of the only frame of a capture without `frames/`."""
+_SYSTEM_PREFIXES = (".", "@", "#", "$", "__")
+"""Of folders that are not the user's: hidden, made by a network disk, an archive or an interpreter."""
+
+
+class FramePaths(NamedTuple):
+    """Where the images of one moment lie."""
+
+    name: str
+    images: tuple[Path | None, ...]
+    """One per camera in the rig's order; None = there is no such file."""
+
+
+def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[FramePaths]:
+    """List the frames of a capture, in natural order of their names.
+
+    Raises:
+        FileNotFoundError: The folder, or every camera's image in it, is missing.
+        ValueError: A camera has two images in a frame, or a frame's name cannot be that of a folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no capture folder at {folder}")
+    if (folder / "frames").is_dir():
+        places = [place for place in (folder / "frames").iterdir() if place.is_dir()]
+        places = sorted((p for p in places if not p.name.startswith(_SYSTEM_PREFIXES)), key=_natural)
+        names = safe_file_names([place.name for place in places], f"{folder / 'frames'}: the frames' names")
+        frames = [
+            FramePaths(name, _images(place, camera_names)) for name, place in zip(names, places, strict=True)
+        ]
+    else:
+        frames = [FramePaths(SINGLE_FRAME, _images(folder, camera_names))]
+    if not any(path for frame in frames for path in frame.images):
+        raise FileNotFoundError(
+            f"no image of the rig's cameras in {folder}: expected {camera_names[0]}.jpg (or .png), ..., or "
+            f"frames/<frame>/{camera_names[0]}.jpg; found {_found(folder)}"
+        )
+    return frames
+
+
+def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) -> Rig:
+    """Read the rig of a capture: the given file, else `rig.json` or `calibration/rig.json` in the folder.
+
+    Raises: FileNotFoundError, ValueError: as `read_rig`.
+    """
+    if rig is not None:
+        return read_rig(rig)
+    places = [Path(folder) / name for name in RIG_FILES]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        looked = " or ".join(map(str, places))
+        raise FileNotFoundError(f"no {looked}: no rig: pass --rig FILE, or put it there")
+    return read_rig(found)
+
+
+def _images(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:
+    """Find every camera's image; a name's accented letters may be written in either form of Unicode."""
+    found: dict[str, list[Path]] = {}
+    for path in sorted(place.iterdir()):
+        if path.suffix.lower() in SUFFIXES:
+            found.setdefault(name_key(path.stem), []).append(path)
+    by_camera = [found.get(name_key(name), []) for name in camera_names]
+    twice = next((paths for paths in by_camera if len(paths) > 1), None)
+    if twice:
+        raise ValueError(f"{place} holds two images of one camera: {twice[0].name} and {twice[1].name}")
+    return tuple(paths[0] if paths else None for paths in by_camera)
+
+
+def _found(folder: Path) -> str:
+    """List a few images of a capture, as paths below it, for a message."""
+    paths = (path for path in sorted(folder.glob("**/*")) if path.suffix.lower() in SUFFIXES)
+    shown = [str(path.relative_to(folder)) for path in itertools.islice(paths, 4)]
+    return ", ".join(shown[:3]) + (", ..." if len(shown) > 3 else "") or "no image"
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
