@@ -6,6 +6,7 @@ part around the hand is rendered. Scenes are a pure function of their seed.
 """
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -18,6 +19,7 @@ from poem_jax.geometry.transforms import (
     transform_points,
 )
 from poem_jax.hand.model import HandModel, hand_mesh, mirror_pose
+from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_SHAPES, ROOT_JOINT, WRIST
 from poem_jax.synthetic.backgrounds import SIZE, make_backgrounds
 from poem_jax.synthetic.config import (
@@ -33,6 +35,7 @@ from poem_jax.synthetic.dataset import Scene, render_view
 from poem_jax.synthetic.poses import sample_pose
 from poem_jax.synthetic.scene import (
     Body,
+    PreparedHand,
     build_mesh,
     cast_shadows,
     draw_light,
@@ -43,11 +46,12 @@ from poem_jax.synthetic.sensor import Exposure, warp_background
 from poem_jax.synthetic.viewpoints import Viewpoints, draw_viewpoints
 from poem_jax.typing import Array, Float, Int, UInt8
 
-_BOX_OVER_HAND = 2.6
-"""Side of the part that is rendered over that of the key points' box; holds the forearm."""
+_BOX_OVER_HAND = 1.8
+"""Side of the part that is rendered over that of the key points' box; holds most of the forearm."""
+_TEXTURES = 4
 _CONFIG = SyntheticConfig(
     supersample=1,
-    body=BodyConfig(forearm_length_m=(0.08, 0.1)),
+    body=BodyConfig(forearm_length_m=(0.04, 0.06)),
     occluders=OccluderConfig(held_probability=0.0, blocker_probability=0.0, stray_probability=0.0),
     light=LightConfig(),
 )
@@ -235,7 +239,7 @@ def _pictures(
     rig: Rig, hand: HandModel, body: Body, keypoints_px: Array, rng: np.random.Generator
 ) -> tuple[UInt8[Array, "h w 3"], ...]:
     """Draw what each camera sees: the texture everywhere, the hand and its forearm in a box."""
-    prepared = prepare_hand(hand)
+    prepared = _shipped() if hand is default_hand() else prepare_hand(hand)
     R, t = rig.T_cam_from_world[:, :3, :3], rig.T_cam_from_world[:, :3, 3]
     centers = -np.einsum("vji,vj->vi", R, t)
     boxes = np.stack([_box(*both) for both in zip(keypoints_px, rig.size_wh, strict=True)])
@@ -245,9 +249,19 @@ def _pictures(
     points = Viewpoints(rig.K, rig.size_wh, rig.T_cam_from_world, centers, boxes, K_box, extent)
     light = draw_light(_CONFIG.light, rng)
     mesh = cast_shadows(build_mesh(prepared, body, centers, _CONFIG, rng), light)
-    textures = make_backgrounds(int(rng.integers(2**31)), 1)
+    texture = _textures()[rng.integers(_TEXTURES)]
     scene = Scene(body, mesh, mesh.attributes(), light, points, [])
-    return tuple(_picture(scene, view, textures[0]) for view in range(len(boxes)))
+    return tuple(_picture(scene, view, texture) for view in range(len(boxes)))
+
+
+@cache
+def _shipped() -> PreparedHand:
+    return prepare_hand(default_hand())
+
+
+@cache
+def _textures() -> UInt8[Array, "texture side side 3"]:
+    return make_backgrounds(0, _TEXTURES)
 
 
 def _picture(scene: Scene, view: int, texture: UInt8[Array, "side side 3"]) -> UInt8[Array, "h w 3"]:
