@@ -43,7 +43,7 @@ FAULTS = {
     "a hand of a fly": ("joints_cam", lambda x: x[:1] + 0.05 * (x - x[:1]), "`joints_cam` is a hand of"),
     "joints behind the camera": ("joints_cam", lambda x: x - [0, 0, 3], "`joints_cam` lies -"),
     "vertices behind the camera": ("vertices_cam", lambda x: x - [0, 0, 3], "`vertices_cam` lies -"),
-    "a hand on the moon": ("joints_cam", lambda x: x + [0, 0, 1e6], "`joints_cam` lies 1e"),
+    "a hand on the moon": ("joints_cam", lambda x: x + np.array([0, 0, 1e6]), "`joints_cam` lies 1e"),
     "NaN joints": ("joints_cam", _not_finite, "`joints_cam` is not finite"),
     "NaN pose": ("pose_cam", _not_finite, "`pose_cam` is not finite"),
     "NaN pixels": ("keypoints_px", _not_finite, "`keypoints_px` is not finite"),
