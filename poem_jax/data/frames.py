@@ -9,7 +9,7 @@ was stored for that one.
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -81,6 +81,7 @@ class MultiViewFrame(NamedTuple):
     see without it: crops are sampled through the lens (`data/lens.py`)."""
 
 
+@runtime_checkable
 class FrameSource(Protocol):
     """A data set, or one split of it, by index. Sources are small, can be pickled (worker processes get
     them), and open files when they are asked."""
