@@ -67,6 +67,7 @@ class ManoFile:
         translation: Float[Array, "*batch 3"] | None = None,
         *,
         wrist_at: Float[Array, "*batch 3"] | None = None,
+        hand: HandModel | None = None,
     ) -> HandMesh:
         """Return vertices and joints, metres, in the frame into which `pose[..., 0, :]` turns.
 
@@ -75,12 +76,14 @@ class ManoFile:
             shape: Coefficients.
             translation: Added to MANO's own place of the hand (its layer without centring).
             wrist_at: Where the wrist joint comes to lie instead (its layer with `center_idx` 0).
+            hand: Taken instead of the file's.
         """
+        hand = self.hand if hand is None else hand
         pose, shape = np.asarray(pose, np.float32), np.asarray(shape, np.float32)
         if wrist_at is not None:
-            return hand_mesh(self.hand, pose, shape, np.asarray(wrist_at, np.float32), center_joint=0)
+            return hand_mesh(hand, pose, shape, np.asarray(wrist_at, np.float32), center_joint=0)
         offset = None if translation is None else np.asarray(translation, np.float32)
-        return hand_mesh(self.hand, pose, shape, offset)
+        return hand_mesh(hand, pose, shape, offset)
 
     def add_mean(self, pose: Float[Array, "*batch 48"]) -> Float[Array, "*batch 16 3"]:
         """Return the pose, zero = flat hand, of 48 numbers that are relative to the mean (`flat_hand_mean`

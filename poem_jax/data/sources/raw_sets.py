@@ -5,12 +5,17 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from poem_jax.data.frames import CorruptSampleError, EncodedImage
+from poem_jax.hand.topology import SKELETON_FROM_OPENPOSE
+from poem_jax.typing import Array, Float
 
 MAX_IMAGE_BYTES = 2**26
 """64 MiB; the images of the public sets have up to 8."""
 _SHARE_OF_PAPER = 0.5
-"""With fewer frames than this share of the paper's, a copy is a part of the set, and its count tells nothing."""
+"""With fewer frames than this share of the paper's, a copy is a part of the set: its count tells nothing."""
+_MAX_APART_M = 0.02
 
 _log = logging.getLogger(__name__)
 
@@ -75,12 +80,34 @@ def check_count(name: str, found: int, paper: int | None, *, strict: bool) -> No
     if paper is None or found == paper or (not strict and found < _SHARE_OF_PAPER * paper):
         return
     message = (
-        f"{name} has {found} multi-view frames, and the paper {paper}: files may be missing, or the set is of "
+        f"{name} has {found} frames, and the paper counts {paper}: files may be missing, or the set is of "
         "another release"
     )
     if strict:
         raise ValueError(message)
     _log.warning("%s", message)
+
+
+def check_mesh(
+    mesh_joints: Float[Array, "view 21 3"], joints: Float[Array, "view 21 3"], path: Path, key: str
+) -> None:
+    """Insist that the skeleton of a mesh is that of the labels; finger tips, which sets define otherwise, may
+    differ.
+
+    Raises:
+        CorruptSampleError: They are further than 2 cm apart: labels that are wrong, or another MANO file or
+            convention than those of the set.
+    """
+    skeleton = list(SKELETON_FROM_OPENPOSE)
+    apart = np.linalg.norm(mesh_joints[:, skeleton] - joints[:, skeleton], axis=-1).max()
+    # Written so that NaN fails too.
+    if not apart <= _MAX_APART_M:
+        raise CorruptSampleError(
+            path,
+            key,
+            f"MANO's joints lie up to {apart:.3g} m from the labelled ones; expected at most {_MAX_APART_M}. "
+            "If all samples fail, the MANO file is not the one that the set was labelled with",
+        )
 
 
 def read_image(path: Path, key: str) -> EncodedImage:

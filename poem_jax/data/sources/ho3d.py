@@ -1,0 +1,259 @@
+"""HO-3D v2 and v3 (Hampali et al., CVPR 2020; arXiv 2107.00887): hands and objects, up to five cameras.
+
+Layout (README of github.com/shreyashampali/ho3d; v2 has PNG in the place of JPEG, and no `calibration`):
+
+    HO3D_v3/{train,evaluation}/<SEQ>/{rgb/%04d.jpg, meta/%04d.pkl}, train.txt, evaluation.txt
+    HO3D_v3/calibration/<MAIN>/calibration/{trans_0.txt .. trans_4.txt, cam_orders.txt}
+    HO3D_v3_manual_test_gt/<SEQ>/meta/%04d.pkl           labels of held-out views, by POEM's authors
+    {HO3D_v2_official_gt,...}/evaluation_{xyz,verts}.json  labels of the official evaluation set
+
+Conventions of the set: metres; OpenGL axes (y up, z backwards), turned here by G = diag(1, -1, -1); joints in
+MANO's order; 48 axis-angle numbers about the flat hand; MANO's layer without centring, then a translation;
+pixels with their origin at a pixel's centre: K and the boxes get + 0.5, key points are projections.
+
+Splits:
+
+- `train`, `test`: multi-view frames (paper: 9,087 and 2,706). A sequence's last digit is its camera; ABF1,
+  BB1, GSF1, MDF1, SiBF1 train, GPMF1 and SB1 test. Camera 2 is first, then 0, 1, 3, 4. Views SB11 and SB13 of
+  the test lie in the official evaluation set: their labels come from the archive (or the official ones,
+  without pose), and their boxes are those of the set.
+- `evaluation`: the official evaluation set, single views with the set's boxes. The authors published its
+  labels in November 2024: `evaluation_xyz.json` and `evaluation_verts.json`, OpenGL axes, MANO's joint order,
+  in the order of `evaluation.txt`; their `eval.py` scores predictions in the same form.
+
+Extrinsics come from `calibration`; without it (v2) from the labels, which are the same hand in all views.
+"""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from poem_jax.data.frames import MultiViewFrame, check_frame
+from poem_jax.data.sources.hand_in_views import ManoFile, span_intrinsics, span_pixels
+from poem_jax.data.sources.ho3d_calibration import Calibration, align_labels
+from poem_jax.data.sources.ho3d_labels import ADVICE, HeldOutLabels, ViewLabel, read_view
+from poem_jax.data.sources.raw_sets import (
+    check_choice,
+    check_count,
+    find_folder,
+    identify,
+    identify_list,
+    need_file,
+    read_image,
+)
+from poem_jax.geometry.cameras import project_cam
+from poem_jax.typing import Array, Float
+
+MAIN_SEQUENCES = {"train": ("ABF1", "BB1", "GSF1", "MDF1", "SiBF1"), "test": ("GPMF1", "SB1")}
+SPLITS = ("train", "test", "evaluation")
+VIEW_ORDER = (2, 0, 1, 3, 4)
+"""Cameras; the first faces the wall and is the constant master."""
+PAPER_COUNTS = {("v3", "train"): 9_087, ("v3", "test"): 2_706}
+EVALUATION_COUNTS = {"v2": 11_524, "v3": 20_137}
+"""Of the official sets, as the authors' `vis_utils.py` states them."""
+WIDTH, HEIGHT = 640, 480
+_SUFFIXES = {"v2": (".png", ".jpg"), "v3": (".jpg", ".png")}
+
+_log = logging.getLogger(__name__)
+
+
+class Member(NamedTuple):
+    """One view of a frame."""
+
+    listed_in: str
+    """"train" or "evaluation": the folder, and the list, that hold it."""
+    sequence: str
+    frame: str
+    row: int
+    """In the list."""
+    place: int
+    """Among the list's lines of this sequence."""
+
+
+class HO3D:
+    """One split of HO-3D; see the module for what each holds."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        split: str = "train",
+        version: str = "v3",
+        mano: str | Path,
+        held_out: str | Path | None = None,
+        strict_counts: bool = False,
+    ) -> None:
+        """List the split from the set's own lists.
+
+        Args:
+            root: The folder `HO3D_v3` (or `HO3D_v2`), or the one that holds it.
+            split: "train", "test" or "evaluation".
+            version: "v2" or "v3".
+            mano: The user's `MANO_RIGHT.pkl`.
+            held_out: Folder of the labels of evaluation images; None looks within and beside the set.
+            strict_counts: Insist on the paper's number of frames.
+
+        Raises:
+            FileNotFoundError: No such set, list, MANO file, or labels of evaluation images where the split
+                cannot do without (v2's `test` leaves these views out instead, with a warning).
+            ValueError: Another split or version, or a damaged list.
+        """
+        check_choice("split", split, SPLITS)
+        check_choice("version", version, EVALUATION_COUNTS)
+        names = (f"HO3D_{version}", f"HO-3D_{version}")
+        self.root = find_folder(root, names, "train.txt", advice=ADVICE)
+        self.name = f"ho3d {version} {split}"
+        self.max_views = 1 if split == "evaluation" else len(VIEW_ORDER)
+        self._version, self._split = version, split
+        self._mano = ManoFile.open(mano)
+        lists = {"train": ("train",), "test": ("train", "evaluation"), "evaluation": ("evaluation",)}[split]
+        self._lists = [need_file(self.root / f"{n}.txt", "a list of samples", advice=ADVICE) for n in lists]
+        members = [member for path in self._lists for member in _read_list(path)]
+        if split == "evaluation":
+            self._held_out = HeldOutLabels.find(self.root, version, held_out, need="official")
+            self._frames = [(member,) for member in members]
+            check_count(self.name, len(self), EVALUATION_COUNTS[version], strict=strict_counts)
+            return
+        members = [member for member in members if _is_view_of(member, MAIN_SEQUENCES[split])]
+        self._held_out = self._find_held_out(members, held_out)
+        if self._held_out is None:
+            members = [member for member in members if member.listed_in == "train"]
+        self._frames = self._group(members)
+        mains = sorted({frame[0].sequence[:-1] for frame in self._frames})
+        self._calibrations = {main: Calibration.read(self.root, main) for main in mains}
+        if version == "v3" and (missing := [main for main, found in self._calibrations.items() if not found]):
+            folder = self.root / "calibration" / missing[0]
+            raise FileNotFoundError(
+                f"the calibration of {missing[0]} is missing: expected {folder}. {ADVICE}"
+            )
+        check_count(self.name, len(self), PAPER_COUNTS.get((version, split)), strict=strict_counts)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> MultiViewFrame:
+        """Read one frame.
+
+        Raises: CorruptSampleError: a file of it is missing or damaged, its labels cannot be true, or the
+            hands of its views do not meet in the world.
+        """
+        members = self._frames[index]
+        first = members[0]
+        key = f"{first.sequence if len(members) == 1 else first.sequence[:-1]}/{first.frame}"
+        folder = self.root / first.listed_in / first.sequence
+        labels = [self._read_label(member, key) for member in members]
+        joints = np.stack([label.joints_cam for label in labels])
+        vertices = np.stack([label.vertices_cam for label in labels])
+        K = span_intrinsics(np.stack([label.K_index for label in labels]))
+        keypoints = project_cam(K, joints)
+        return check_frame(
+            MultiViewFrame(
+                key=key,
+                images=tuple(read_image(self._image_path(member), key) for member in members),
+                view_names=tuple(member.sequence for member in members),
+                size_wh=np.tile([WIDTH, HEIGHT], (len(members), 1)),
+                K=K,
+                T_cam_from_world=self._extrinsics(members, joints, key),
+                joints_cam=joints.astype(np.float32),
+                vertices_cam=vertices.astype(np.float32),
+                keypoints_px=keypoints,
+                pose_cam=_stacked([label.pose_cam for label in labels]),
+                shape=_stacked([label.shape for label in labels]),
+                box_px=_boxes(labels, keypoints),
+            ),
+            folder,
+        )
+
+    def fingerprint(self) -> Mapping[str, str]:
+        """Return what identifies the list of samples."""
+        keys = (" ".join(f"{m.sequence}/{m.frame}" for m in frame) for frame in self._frames)
+        return {
+            **{str(path): identify(path) for path in self._lists},
+            f"{self.root}, {self.name}": identify_list(keys),
+        }
+
+    def _find_held_out(self, members: list[Member], folder: str | Path | None) -> HeldOutLabels | None:
+        """Return the labels of evaluation images, if any are among the members."""
+        count = sum(member.listed_in == "evaluation" for member in members)
+        if not count:
+            return None
+        try:
+            return HeldOutLabels.find(self.root, self._version, folder, need="any")
+        except FileNotFoundError as error:
+            if self._version == "v3" or folder is not None:
+                raise
+            _log.warning("%s: %d views are left out: %s", self.name, count, error)
+            return None
+
+    def _group(self, members: list[Member]) -> list[tuple[Member, ...]]:
+        """Return frames in first-seen order, each with its views in the set's order."""
+        groups: dict[tuple[str, str], dict[int, Member]] = {}
+        for member in members:
+            views = groups.setdefault((member.sequence[:-1], member.frame), {})
+            views[int(member.sequence[-1])] = member
+        frames = [tuple(views[d] for d in VIEW_ORDER if d in views) for views in groups.values()]
+        kept = [frame for frame in frames if frame and int(frame[0].sequence[-1]) == VIEW_ORDER[0]]
+        if len(kept) < len(frames):
+            _log.warning(
+                "%s: %d frames are left out, as they lack camera %d, which comes first",
+                *(self.name, len(frames) - len(kept), VIEW_ORDER[0]),
+            )
+        return kept
+
+    def _read_label(self, member: Member, key: str) -> ViewLabel:
+        path = self.root / member.listed_in / member.sequence / "meta" / f"{member.frame}.pkl"
+        held_out = None
+        if member.listed_in == "evaluation" and self._held_out is not None:
+            held_out = self._held_out.read(member.sequence, member.place, member.row, key)
+        return read_view(path, key, self._mano, held_out)
+
+    def _extrinsics(
+        self, members: tuple[Member, ...], joints_cam: Float[Array, "view 21 3"], key: str
+    ) -> Float[Array, "view 4 4"]:
+        if self._split == "evaluation":
+            return np.eye(4)[None]
+        main, digits = members[0].sequence[:-1], [int(member.sequence[-1]) for member in members]
+        calibration = self._calibrations[main]
+        if calibration is None:
+            return align_labels(joints_cam, self.root / members[0].listed_in / main, key)
+        return calibration.extrinsics(digits, joints_cam, key)
+
+    def _image_path(self, member: Member) -> Path:
+        folder = self.root / member.listed_in / member.sequence / "rgb"
+        paths = [folder / f"{member.frame}{suffix}" for suffix in _SUFFIXES[self._version]]
+        return next((path for path in paths if path.is_file()), paths[0])
+
+
+def _is_view_of(member: Member, mains: tuple[str, ...]) -> bool:
+    return member.sequence[:-1] in mains and member.sequence[-1].isdigit()
+
+
+def _read_list(path: Path) -> list[Member]:
+    members, places = [], {}
+    for row, line in enumerate(path.read_text(encoding="utf-8").split()):
+        sequence, slash, frame = line.partition("/")
+        if not slash or not (sequence.isalnum() and frame.isdigit()):
+            raise ValueError(f"{path} must have one SEQUENCE/FRAME per line; line {row + 1} is {line[:60]!r}")
+        places[sequence] = places.get(sequence, -1) + 1
+        members.append(Member(path.stem, sequence, frame, row, places[sequence]))
+    return members
+
+
+def _stacked(values: list[Array | None]) -> Array | None:
+    known = [value for value in values if value is not None]
+    return np.stack(known).astype(np.float32) if len(known) == len(values) else None
+
+
+def _boxes(labels: list[ViewLabel], keypoints_px: Float[Array, "view 21 2"]) -> Float[Array, "view 4"] | None:
+    """Return the set's boxes where it has them, else those of the key points; None where it has none."""
+    if all(label.box_index is None for label in labels):
+        return None
+    around = np.concatenate([keypoints_px.min(1), keypoints_px.max(1)], axis=-1)
+    given = [
+        own if label.box_index is None else span_pixels(label.box_index)
+        for label, own in zip(labels, around, strict=True)
+    ]
+    return np.stack(given)
