@@ -16,7 +16,7 @@ from poem_jax.capture.hand_matching import match_views
 from poem_jax.capture.hand_tracks import Track, follow_hands
 from poem_jax.capture.lone_detections import join_lone_detections
 from poem_jax.capture.sightings import NONE, Sightings, sightings_of_frames, vote_for_right
-from poem_jax.capture.take import hand_names
+from poem_jax.data.capture_folder import hand_names
 from poem_jax.detection import DetectedHand
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.world_origin import distant_origin, move_origin

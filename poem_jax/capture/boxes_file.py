@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from poem_jax.data.capture_folder import frame_key
 from poem_jax.geometry.rig import HALF_PIXEL
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.io.atomic import whole_file
@@ -216,11 +217,6 @@ def _take_everywhere(boxes: HandBoxes, rows: Array, axis: int) -> HandBoxes:
 def _take(array: Array, rows: Array, axis: int) -> Array:
     found = np.expand_dims(rows >= 0, tuple(i for i in range(array.ndim) if i != axis))
     return np.where(found, array.take(rows, axis), np.nan)
-
-
-def frame_key(name: str) -> str | int:
-    """Return what makes two names those of one frame: '9' is '0009', and accents may be written two ways."""
-    return int(name) if name.isdecimal() else name_key(name)
 
 
 def _sides(content: Mapping[str, Array], path: Path) -> tuple[str, ...]:

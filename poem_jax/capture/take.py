@@ -11,12 +11,11 @@ from poem_jax.capture.boxes_file import (
     HOW_TO_GET_BOXES,
     HandBoxes,
     align_boxes,
-    frame_key,
     read_boxes,
     without_boxes_outside,
 )
 from poem_jax.capture.frame import Frame
-from poem_jax.data.capture_folder import FramePaths, find_frames, find_rig
+from poem_jax.data.capture_folder import FramePaths, find_frames, find_rig, frame_key, hand_names
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import safe_file_names
 
@@ -165,13 +164,6 @@ def in_groups(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:
             group = []
     if group:
         yield group
-
-
-def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:
-    """Return `right`, `left`, or `right_0`, `right_1` where a side comes more than once."""
-    return tuple(
-        side if sides.count(side) == 1 else f"{side}_{sides[:i].count(side)}" for i, side in enumerate(sides)
-    )
 
 
 def _check_numbers_differ(names: Iterable[str]) -> None:

@@ -59,8 +59,7 @@ def find_keypoints(
 
     from poem_jax.capture.boxes_file import write_boxes
     from poem_jax.capture.detect import detect_hands
-    from poem_jax.capture.take import hand_names
-    from poem_jax.data.capture_folder import RIG_FILES, find_frames, find_rig
+    from poem_jax.data.capture_folder import RIG_FILES, find_frames, find_rig, hand_names
     from poem_jax.io.writable import check_inputs_stay
 
     if max_hands < 1:

@@ -68,14 +68,32 @@ def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) ->
 
     Raises: FileNotFoundError, ValueError: as `read_rig`.
     """
-    if rig is not None:
-        return read_rig(rig)
+    return read_rig(find_rig_file(folder) if rig is None else rig)
+
+
+def find_rig_file(folder: str | os.PathLike) -> Path:
+    """Return the rig's file in a capture's folder.
+
+    Raises: FileNotFoundError: there is none.
+    """
     places = [Path(folder) / name for name in RIG_FILES]
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         looked = " or ".join(map(str, places))
         raise FileNotFoundError(f"no {looked}: no rig: pass --rig FILE, or put it there")
-    return read_rig(found)
+    return found
+
+
+def frame_key(name: str) -> str | int:
+    """Return what makes two names those of one frame: '9' is '0009', and accents may be written two ways."""
+    return int(name) if name.isdecimal() else name_key(name)
+
+
+def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:
+    """Return `right`, `left`, or `right_0`, `right_1` where a side comes more than once."""
+    return tuple(
+        side if sides.count(side) == 1 else f"{side}_{sides[:i].count(side)}" for i, side in enumerate(sides)
+    )
 
 
 def _images(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:

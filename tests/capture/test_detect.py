@@ -6,9 +6,8 @@ import pytest
 
 from poem_jax.capture.boxes_file import HandBoxes, read_boxes
 from poem_jax.capture.detect import detect_hands
-from poem_jax.capture.take import hand_names
 from poem_jax.cli import main
-from poem_jax.data.capture_folder import find_frames
+from poem_jax.data.capture_folder import find_frames, hand_names
 from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
 from poem_jax.hand.model import hand_mesh

@@ -3,7 +3,8 @@
 import pytest
 
 from poem_jax.capture.boxes_file import write_boxes
-from poem_jax.capture.take import hand_names, read_keypoint_take, read_take
+from poem_jax.capture.take import read_keypoint_take, read_take
+from poem_jax.data.capture_folder import hand_names
 
 
 def test_what_is_missing_is_said(make_capture, tmp_path):
