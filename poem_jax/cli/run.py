@@ -13,17 +13,19 @@ from poem_jax.cli.evaluate import Eval
 from poem_jax.cli.export_torch import ExportTorch
 from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
+from poem_jax.cli.inspect import Inspect
 from poem_jax.cli.messages import set_up_logging
 from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop_on_signals
 from poem_jax.cli.train import Train
 
-Command = Demo | Reconstruct | Fit | Detect | Train | Eval | ImportTorch | ExportTorch
+Command = Demo | Reconstruct | Fit | Detect | Inspect | Train | Eval | ImportTorch | ExportTorch
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
+    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[ImportTorch, tyro.conf.subcommand("import-torch")]

@@ -122,3 +122,31 @@ def take_picture(image: UInt8[Array, "h w 3"], where: PictureMap) -> UInt8[Array
     if fine.shape[:2] == where.hw:
         return fine
     return cv2.resize(fine, where.hw[::-1], interpolation=cv2.INTER_AREA)
+
+
+def stored_picture_map(
+    K: Float[Array, "3 3"],
+    dist: Float[Array, " term"] | None,
+    mirror_px: float | None,
+    K_picture: Float[Array, "3 3"],
+    hw: tuple[int, int],
+    step: float,
+) -> PictureMap:
+    """Prepare to see what a view of a `data.frames.MultiViewFrame` shows, from its image as stored.
+
+    Args:
+        K: Of the view, after its mirror.
+        dist: Lens of the stored image; None = it has none.
+        mirror_px: Column about which the stored image is to be turned left to right; None = it is not.
+        K_picture: Of the picture wanted; an affine change H of the view's ideal image has H @ K.
+        hw: Its size.
+        step: Pixels of the image per picture pixel, as for `picture_map`.
+    """
+    K_stored = np.array(K, np.float64)
+    dist = np.zeros(5) if dist is None else np.asarray(dist, np.float64)
+    if mirror_px is None:
+        return picture_map(K_stored, dist, np.asarray(K_picture, np.float64), hw, step)
+    # K of the stored image is M K D, with M the turn of pixels, D = diag(-1, 1, 1) that of rays.
+    K_stored[0, 1] = -K_stored[0, 1]
+    K_stored[0, 2] = 2 * mirror_px - K_stored[0, 2]
+    return picture_map(K_stored, dist, np.asarray(K_picture, np.float64) * [-1, 1, 1], hw, step)

@@ -1,0 +1,40 @@
+"""What a stored image shows of a view, through its lens and its mirror, lands where the labels say."""
+
+import numpy as np
+import pytest
+
+from poem_jax.data.lens import stored_picture_map, take_picture
+from poem_jax.geometry.cameras import crop_homography, transform_pixels
+from poem_jax.geometry.distortion import distort_pixels
+
+K_STORED = np.array([[300.0, 0.7, 151], [0, 310, 126], [0, 0, 1]])
+DIST = np.array([-0.3, 0.05, -0.004, 0.004, 0.06])
+HW = (240, 320)
+
+
+def dot(centre_px):
+    v, u = np.meshgrid(np.arange(HW[0]) + 0.5, np.arange(HW[1]) + 0.5, indexing="ij")
+    value = 255 * np.exp(-((u - centre_px[0]) ** 2 + (v - centre_px[1]) ** 2) / 12.5)
+    return np.repeat(np.rint(value).astype(np.uint8)[..., None], 3, -1)
+
+
+def centroid(image):
+    weight = image[..., 0].astype(np.float64)
+    v, u = np.meshgrid(np.arange(image.shape[0]) + 0.5, np.arange(image.shape[1]) + 0.5, indexing="ij")
+    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+
+
+@pytest.mark.parametrize("dist", [None, DIST])
+@pytest.mark.parametrize("mirror_px", [None, 151.0, 160.0])
+def test_a_point_of_the_stored_image_lands_where_its_label_does(dist, mirror_px):
+    ideal = np.array([[205.0, 90.0]])
+    raw = ideal if dist is None else distort_pixels(ideal, K_STORED, dist)
+    K = K_STORED.copy()
+    if mirror_px is not None:
+        ideal = np.array([[2 * mirror_px, 0]]) + ideal * [-1, 1]
+        K[0, 1], K[0, 2] = -K[0, 1], 2 * mirror_px - K[0, 2]
+    box = np.array([*(ideal[0] - [40, 30]), *(ideal[0] + [30, 40])])
+    H = crop_homography(box, (112, 112))
+    where = stored_picture_map(K, dist, mirror_px, H @ K, (112, 112), 0.6)
+    seen = centroid(take_picture(dot(raw[0]), where))
+    assert np.allclose(seen, transform_pixels(H, ideal)[0], atol=0.15)
