@@ -113,7 +113,7 @@ class FreiHAND:
             MultiViewFrame(
                 key=f"{self._images.parent.name}/{path.stem}",
                 images=(read_image(path, path.stem),),
-                view_names=("camera",),
+                view_names=("0",),
                 size_wh=np.array([[SIZE, SIZE]]),
                 K=K[None],
                 T_cam_from_world=np.eye(4)[None],

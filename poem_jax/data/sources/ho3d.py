@@ -153,7 +153,7 @@ class HO3D:
             MultiViewFrame(
                 key=key,
                 images=tuple(read_image(self._image_path(member), key) for member in members),
-                view_names=tuple(member.sequence for member in members),
+                view_names=tuple(member.sequence[-1] for member in members),
                 size_wh=np.tile([WIDTH, HEIGHT], (len(members), 1)),
                 K=K,
                 T_cam_from_world=self._extrinsics(members, joints, key),

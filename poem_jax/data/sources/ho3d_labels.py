@@ -25,8 +25,8 @@ ADVICE = (
 )
 _ARCHIVE_ADVICE = (
     "POEM's authors give HO3D_v3_manual_test_gt.zip (docs/datasets.md of github.com/lixiny/POEM); HO-3D's "
-    "own evaluation_xyz.json and evaluation_verts.json are linked from github.com/shreyashampali/ho3d. Put them "
-    "beside the set, or name their folder with `held_out`"
+    "own evaluation_xyz.json and evaluation_verts.json are linked from github.com/shreyashampali/ho3d. Put "
+    "them beside the set, or name their folder with `held_out`"
 )
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 _OFFICIAL = ("evaluation_xyz.json", "evaluation_verts.json")
@@ -70,7 +70,7 @@ class HeldOutLabels(NamedTuple):
             root: The set's folder.
             version: "v2" or "v3".
             folder: Where the user says they are; None looks within the set and beside it.
-            need: "official" insists on the two lists, "any" is content with the archive.
+            need: "official" takes the two lists alone, "any" the archive, and the lists for what it lacks.
 
         Raises:
             FileNotFoundError: There are none; says where to get them.
@@ -88,7 +88,7 @@ class HeldOutLabels(NamedTuple):
                 f"the labels of evaluation images are missing: expected {wanted} in {places[0]} (or "
                 f"{', '.join(str(place) for place in places[1:])}). {_ARCHIVE_ADVICE}"
             )
-        return cls(archive, official)
+        return cls(None if need == "official" else archive, official)
 
     def read(self, sequence: str, place: int, row: int, key: str) -> HeldOut:
         """Return the labels of one image.
@@ -158,8 +158,8 @@ def _check_root(label: dict[str, Any], held_out: HeldOut, path: Path, key: str) 
         raise CorruptSampleError(
             path,
             key,
-            f"its wrist lies {apart:.3g} m from that of its held-out labels; expected at most {_ROOT_APART_M}. "
-            "The labels are of another image",
+            f"its wrist lies {apart:.3g} m from that of its held-out labels; expected at most "
+            f"{_ROOT_APART_M}. The labels are of another image",
         )
 
 
