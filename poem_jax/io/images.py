@@ -40,14 +40,18 @@ _ORIENTATION_TAG = 0x0112
 _log = logging.getLogger(__name__)
 
 
-class _Header(NamedTuple):
+class ImageHeader(NamedTuple):
+    """What a JPEG or PNG says of itself before its pixels."""
+
     size_wh: tuple[int, int]
     """As stored, before any turn."""
     orientation: int = 1
     """EXIF: 1 = as stored, 2..8 = turned by quarters, mirrored or both; from 5 on the sides swap."""
+    is_jpeg: bool = False
 
     @property
     def shown_wh(self) -> tuple[int, int]:
+        """Width and height after the turn."""
         width, height = self.size_wh
         return (height, width) if self.orientation >= 5 else (width, height)
 
@@ -71,36 +75,52 @@ def read_image(path: str | os.PathLike, size_wh: tuple[int, int] | None = None) 
     if path.stat().st_size > _MAX_BYTES:
         raise ValueError(f"{path} has {path.stat().st_size} bytes, too many for an image")
     data = path.read_bytes()
+    header = read_header(data, path)
+    turned = is_to_be_turned(header, size_wh, path)
+    image = decode_stored(data, header, path)
+    return turn(image, header.orientation) if turned else image
+
+
+def read_header(data: bytes, name: str | os.PathLike) -> ImageHeader:
+    """Read what an image says of itself.
+
+    Args:
+        data: The whole file.
+        name: Of the image, for messages; here and below.
+
+    Raises:
+        ValueError: It is neither JPEG nor PNG, or is damaged.
+    """
     try:
-        header = _read_header(data)
+        return _read_header(data)
     except (ValueError, IndexError, struct.error) as error:
         raise ValueError(
-            f"{path} cannot be read as an image ({len(data)} bytes); it is damaged or of another kind: "
+            f"{name} cannot be read as an image ({len(data)} bytes); it is damaged or of another kind: "
             f"{error}"
         ) from error
-    turned = _is_to_be_turned(header, size_wh, path)
-    stored = _decode(data, header, path)
-    image = _eight_bit(stored, path)[..., ::-1]
-    return np.ascontiguousarray(_turn(image, header.orientation) if turned else image)
 
 
-def _is_to_be_turned(header: _Header, size_wh: tuple[int, int] | None, path: Path) -> bool:
-    """Check the image's size and decide whether to follow its orientation."""
+def is_to_be_turned(header: ImageHeader, size_wh: tuple[int, int] | None, name: str | os.PathLike) -> bool:
+    """Check the image's size and decide whether to follow its orientation; see `read_image`.
+
+    Raises:
+        ValueError: Too many pixels, another size than `size_wh`, or one that cannot decide.
+    """
     width, height = header.size_wh
     if not 0 < width * height <= MAX_PIXELS:
-        raise ValueError(f"{path} says it is {width} x {height}; an image has 1 to {MAX_PIXELS} pixels")
+        raise ValueError(f"{name} says it is {width} x {height}; an image has 1 to {MAX_PIXELS} pixels")
     if size_wh is None:
         return header.orientation != 1
     as_stored, as_shown = (tuple(size_wh) == size for size in (header.size_wh, header.shown_wh))
     if not as_stored and not as_shown:
         turned = f" (turned by its EXIF orientation {header.orientation})" if header.orientation >= 5 else ""
         raise ValueError(
-            f"{path} is {width} x {height}{turned}; the rig was calibrated at {size_wh[0]} x {size_wh[1]}: "
+            f"{name} is {width} x {height}{turned}; the rig was calibrated at {size_wh[0]} x {size_wh[1]}: "
             "use the images as calibrated, or scale `K`, width and height in the rig"
         )
     if header.orientation != 1 and as_stored and as_shown:
         raise ValueError(
-            f"{path} has EXIF orientation {header.orientation}, and its size fits the rig turned and not "
+            f"{name} has EXIF orientation {header.orientation}, and its size fits the rig turned and not "
             "turned: the calibration may belong to either. Save the images without the tag, as they were "
             "calibrated: turned (`mogrify -auto-orient`), as OpenCV's imread shows them, or as stored "
             "(`exiftool -Orientation= `)"
@@ -108,20 +128,24 @@ def _is_to_be_turned(header: _Header, size_wh: tuple[int, int] | None, path: Pat
     return not as_stored
 
 
-def _decode(data: bytes, header: _Header, path: Path) -> Array:
-    """Decode to BGR of 8 or 16 bits, as stored."""
+def decode_stored(data: bytes, header: ImageHeader, name: str | os.PathLike) -> UInt8[Array, "h w 3"]:
+    """Decode to RGB of 8 bits with OpenCV, as stored, without any turn.
+
+    Raises:
+        ValueError: The pixels are damaged.
+    """
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise ValueError(f"{path} cannot be read as an image: {error.err}") from error
+        raise ValueError(f"{name} cannot be read as an image: {error.err}") from error
     expected = (*header.size_wh[::-1], 3)
     if bgr is None or bgr.shape != expected or bgr.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{path} cannot be read as an image ({len(data)} bytes): it is damaged")
-    return bgr
+        raise ValueError(f"{name} cannot be read as an image ({len(data)} bytes): it is damaged")
+    return cv2.cvtColor(_eight_bit(bgr, name), cv2.COLOR_BGR2RGB)
 
 
-def _eight_bit(image: Array, path: Path) -> UInt8[Array, "h w 3"]:
+def _eight_bit(image: Array, name: str | os.PathLike) -> UInt8[Array, "h w 3"]:
     if image.dtype == np.uint8:
         return image
     largest = int(image.max())
@@ -131,7 +155,7 @@ def _eight_bit(image: Array, path: Path) -> UInt8[Array, "h w 3"]:
         _log.warning(
             "%s stores 16 bits a value, but none is above %d: it is read as an image of %d bits, and so are "
             "others like it; if that is wrong, save the images with 8 bits",
-            *(path, largest, bits),
+            *(name, largest, bits),
         )
     return (image >> (bits - 8)).astype(np.uint8)
 
@@ -140,16 +164,16 @@ _said_depths: set[int] = set()
 """Depths that a warning has told of: a long take has a thousand images of each."""
 
 
-def _turn(image: Array, orientation: int) -> Array:
-    """Return the image (h, w, 3) as an EXIF orientation wants it shown."""
+def turn(image: UInt8[Array, "h w 3"], orientation: int) -> UInt8[Array, "shown_h shown_w 3"]:
+    """Return the image as an EXIF orientation wants it shown."""
     if orientation >= 5:
         image = image.swapaxes(0, 1)
     # Which of rows and columns then run backwards.
     rows, columns = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
-    return image[:: -1 if rows else 1, :: -1 if columns else 1]
+    return np.ascontiguousarray(image[:: -1 if rows else 1, :: -1 if columns else 1])
 
 
-def _read_header(data: bytes) -> _Header:
+def _read_header(data: bytes) -> ImageHeader:
     """Read size and orientation.
 
     Raises:
@@ -162,7 +186,7 @@ def _read_header(data: bytes) -> _Header:
     raise ValueError("it begins neither as JPEG nor as PNG")
 
 
-def _read_png_header(data: bytes) -> _Header:
+def _read_png_header(data: bytes) -> ImageHeader:
     """Walk over the chunks: length, kind, contents, checksum."""
     size_wh, orientation, position = None, 1, len(_PNG_START)
     while size_wh is None or data[position + 4 : position + 8] != b"IEND":
@@ -172,10 +196,10 @@ def _read_png_header(data: bytes) -> _Header:
         elif kind == b"eXIf":
             orientation = _orientation(data[position + 8 : position + 8 + length])
         position += 12 + length
-    return _Header(size_wh, orientation)
+    return ImageHeader(size_wh, orientation)
 
 
-def _read_jpeg_header(data: bytes) -> _Header:
+def _read_jpeg_header(data: bytes) -> ImageHeader:
     """Walk over the segments, marker, length and contents, up to the scan, where the pixels begin."""
     # OpenCV would give a part of a picture that breaks off.
     if data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN):
@@ -198,7 +222,7 @@ def _read_jpeg_header(data: bytes) -> _Header:
         position += 2 + length
     if size_wh is None:
         raise ValueError("its size is missing")
-    return _Header(size_wh, orientation)
+    return ImageHeader(size_wh, orientation, is_jpeg=True)
 
 
 def _orientation(tiff: bytes) -> int:

@@ -1,0 +1,89 @@
+"""Which views of a frame a sample is made of, and in which order; the first becomes the world.
+
+Every rule draws indices into the frame's views from a given generator, so that a sample depends on nothing
+but its seed.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from poem_jax.typing import Array, Int
+
+RELEASE_MEAN, RELEASE_SPREAD = 4.0, 2.0
+"""Of the number of views in POEM v2's released reader."""
+
+
+class ViewSampling(Protocol):
+    """A rule by which views are drawn."""
+
+    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+        """Return indices below `num_views`, each at most once; the first is the primary view."""
+        ...
+
+
+@dataclass(frozen=True)
+class UniformViews:
+    """The paper's rule: each number of views from `min` to `max` as often, in random order."""
+
+    min: int = 1
+    max: int | None = None
+    """None = all that the frame has. A frame with fewer has its own number as the largest."""
+
+    def __post_init__(self) -> None:
+        _check_range(self.min, self.max)
+
+    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+        """Draw; see `ViewSampling`."""
+        high = num_views if self.max is None else min(self.max, num_views)
+        order = rng.permutation(num_views)
+        return order[: rng.integers(min(self.min, high), high, endpoint=True)]
+
+
+@dataclass(frozen=True)
+class ReleaseNormalViews:
+    """POEM v2's released rule: a rounded N(4, 2), held to `low` .. `high`, then to what there is, in random
+    order. Its evaluations with n views are `ReleaseNormalViews(n, n)`: order and primary view are random there
+    too.
+    """
+
+    low: int
+    high: int
+
+    def __post_init__(self) -> None:
+        _check_range(self.low, self.high)
+
+    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+        """Draw; see `ViewSampling`."""
+        order = rng.permutation(num_views)
+        count = round(rng.normal(RELEASE_MEAN, RELEASE_SPREAD))
+        return order[: min(max(count, self.low), self.high)]
+
+
+@dataclass(frozen=True)
+class AllViews:
+    """POEM v1's rule: all views in the frame's own order, whose first is the constant master."""
+
+    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+        """Return all; nothing is drawn."""
+        return np.arange(num_views)
+
+
+@dataclass(frozen=True)
+class FixedViews:
+    """The first `count` views in the frame's own order, or all where it has fewer."""
+
+    count: int
+
+    def __post_init__(self) -> None:
+        _check_range(self.count, None)
+
+    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+        """Return the first ones; nothing is drawn."""
+        return np.arange(min(self.count, num_views))
+
+
+def _check_range(low: int, high: int | None) -> None:
+    if low < 1 or (high is not None and high < low):
+        raise ValueError(f"numbers of views must be at least 1, the larger one last; got {low} to {high}")
