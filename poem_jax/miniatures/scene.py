@@ -15,12 +15,13 @@ import numpy as np
 from poem_jax.geometry.cameras import project_cam
 from poem_jax.geometry.transforms import (
     axis_angle_from_rotation,
+    invert_rigid,
     rotation_from_axis_angle,
     transform_points,
 )
 from poem_jax.hand.model import HandModel, hand_mesh, mirror_pose
 from poem_jax.hand.template import default_hand
-from poem_jax.hand.topology import NUM_SHAPES, ROOT_JOINT, WRIST
+from poem_jax.hand.topology import FINGER_JOINTS, NUM_SHAPES, ROOT_JOINT, TIP_VERTICES_REGRESSED, WRIST
 from poem_jax.synthetic.backgrounds import SIZE, make_backgrounds
 from poem_jax.synthetic.config import (
     BodyConfig,
@@ -208,6 +209,26 @@ def take_views(frame: PlantedFrame, views: Sequence[int]) -> PlantedFrame:
         images=tuple(frame.images[i] for i in chosen),
         **{name: getattr(frame, name)[chosen] for name in arrays},
     )
+
+
+def anchored(frame: PlantedFrame, view: int) -> PlantedFrame:
+    """Return the frame with the given camera as its world."""
+    T = frame.T_cam_from_world
+    T_cam_from_anchor = T @ invert_rigid(T[view])
+    T_cam_from_anchor[view] = np.eye(4)
+    return frame._replace(T_cam_from_world=T_cam_from_anchor)
+
+
+def with_mesh_tips(frame: PlantedFrame) -> PlantedFrame:
+    """Return the frame with its finger tips at the second set of tip vertices, key points likewise.
+
+    HO-3D's and FreiHAND's joints are the posed skeleton with these (`smpl_handpca_wrapper_HAND_only.py`
+    and `mano_utils.py` of their toolboxes), up to 8 mm from those of a MANO layer.
+    """
+    joints_cam = frame.joints_cam.copy()
+    tips = [finger[-1] for finger in FINGER_JOINTS]
+    joints_cam[:, tips] = frame.vertices_cam[:, list(TIP_VERTICES_REGRESSED)]
+    return frame._replace(joints_cam=joints_cam, keypoints_px=project_cam(frame.K, joints_cam))
 
 
 def mirrored(frame: PlantedFrame) -> PlantedFrame:
