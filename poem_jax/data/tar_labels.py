@@ -7,7 +7,7 @@ sample). What its numbers mean depends on the data set; `CONVENTIONS` says it, a
   has one camera, which is the world.
 - `mano_pose` is zero for a flat hand (DexYCB, HO-3D, FreiHAND: their readers add MANO's mean pose, or the
   data set has none), or relative to MANO's mean pose (ARCTIC, InterHand2.6M: their readers give the stored
-  numbers to a layer with `flat_hand_mean` False). OakInk's tars lack it. Zeros throughout stand for a pose
+  numbers to a layer with `flat_hand_mean` False). OakInk's released tars lack it. Zeros throughout stand for a pose
   that is not known.
 - Pixels have their origin at the *centre* of the first pixel, as the tools with which these sets were
   calibrated: 0.5 is added to cx, cy, `joints_2d` and `bbox_center`.
@@ -57,13 +57,12 @@ class TarConvention(NamedTuple):
     extrinsics: Extrinsics
     pose_lacks_mean: bool = False
     """True: MANO's mean pose must be added, which needs the user's MANO file."""
-    stores_pose: bool = True
 
 
 CONVENTIONS = (
     TarConvention("DexYCB", Extrinsics.CAMERA_TO_WORLD),
     TarConvention("HO3D", Extrinsics.CAMERA_TO_WORLD),
-    TarConvention("Oakink", Extrinsics.WORLD_TO_CAMERA, stores_pose=False),
+    TarConvention("Oakink", Extrinsics.WORLD_TO_CAMERA),
     TarConvention("Arctic", Extrinsics.WORLD_TO_CAMERA, pose_lacks_mean=True),
     TarConvention("Interhand", Extrinsics.WORLD_TO_CAMERA, pose_lacks_mean=True),
     TarConvention("Freihand", Extrinsics.NONE),

@@ -264,8 +264,7 @@ def test_what_is_packed_is_what_is_read(mano, name, side):
     label = label_from_frame(frame, convention, index=3, mano=hand)
     again = pickle.loads(pickle.dumps(label))
     read = frame_from_label(again, frame.images, convention, path="a.tar", key=frame.key, mano=hand)
-    if convention.stores_pose:
-        assert_same_hand(read, frame)
+    assert_same_hand(read, frame)
     for field in ("box_px", "mirror_px"):
         value = getattr(frame, field)
         got = getattr(read, field)
