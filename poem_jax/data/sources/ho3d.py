@@ -253,7 +253,7 @@ def _boxes(labels: list[ViewLabel], keypoints_px: Float[Array, "view 21 2"]) -> 
         return None
     around = np.concatenate([keypoints_px.min(1), keypoints_px.max(1)], axis=-1)
     given = [
-        own if label.box_index is None else span_pixels(label.box_index)
+        own if label.box_index is None else span_pixels(label.box_index.reshape(2, 2)).reshape(4)
         for label, own in zip(labels, around, strict=True)
     ]
     return np.stack(given)
