@@ -22,11 +22,12 @@ from poem_jax.miniatures.scene import (
 )
 
 NAMES = ("a", "b", "c")
+SIZES = [(320, 240), (240, 320), (320, 240)]
 
 
 @pytest.fixture(scope="session", params=["right", "left"])
 def frame(request: pytest.FixtureRequest) -> tuple[PlantedFrame, str]:
-    rig = draw_rig((3, 1), NAMES, [(320, 240), (240, 320), (320, 240)])
+    rig = draw_rig((3, 1), NAMES, SIZES)
     return plant((3, 2), rig, stand_in_hand(request.param), key_hint="x/1"), request.param
 
 
@@ -55,9 +56,7 @@ def test_pose_shape_and_translation_give_the_vertices(frame: tuple[PlantedFrame,
 
 def test_a_picture_shows_the_hand_where_the_key_points_are(frame: tuple[PlantedFrame, str]) -> None:
     planted, side = frame
-    elsewhere = plant(
-        (3, 4), draw_rig((3, 1), NAMES, planted.size_wh.tolist()), stand_in_hand(side), key_hint=""
-    )
+    elsewhere = plant((3, 4), draw_rig((3, 1), NAMES, SIZES), stand_in_hand(side), key_hint="")
     for view, image in enumerate(planted.images):
         width, height = planted.size_wh[view]
         assert image.shape == (height, width, 3)
