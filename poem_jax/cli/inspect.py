@@ -35,7 +35,7 @@ class Inspect:
     kind: Kinds | None = None
     """What PATH is; found out where it is not said."""
     split: str | None = None
-    """Without it train, or what the names of tars say."""
+    """Without it the training set; tars say theirs in their names, and need it where there are several."""
     mano: OptionalFile = None
     """Your MANO_RIGHT.pkl: raw sets need it for their vertices, tars for MANO's mean pose."""
     samples: int = 4

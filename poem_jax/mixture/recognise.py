@@ -83,7 +83,7 @@ def source_at(path: str | Path, kind: Kind, *, split: str | None, mano: str | Pa
     Args:
         path: See `recognise`.
         kind: What it is.
-        split: None = `train`; tars say theirs in their names.
+        split: None = the paper's training set; tars say theirs in their names.
         mano: The user's MANO file.
 
     Raises:
@@ -96,7 +96,8 @@ def source_at(path: str | Path, kind: Kind, *, split: str | None, mano: str | Pa
         if split is not None:
             raise ValueError(f"a capture has no splits; got --split {split}")
         return CapturesSource((root,))
-    split = "train" if split is None else split
+    if split is None:
+        split = "train+val" if kind is Kind.OAKINK else "train"
     if kind is Kind.OAKINK:
         return OakInkSource(root, mano=hand, split=split)
     if kind is Kind.FREIHAND:

@@ -70,7 +70,7 @@ def test_what_is_not_recognised_says_what_could_be(tmp_path):
     with pytest.raises(FileNotFoundError, match="nothing that could be a data set"):
         recognise(tmp_path / "missing")
     (tmp_path / "notes").mkdir()
-    with pytest.raises(ValueError, match="--kind, one of tars, capture.*it holds notes"):
+    with pytest.raises(ValueError, match=r"--kind, one of tars, capture.*it holds notes"):
         recognise(tmp_path)
     plant(tmp_path, TREES[Kind.FREIHAND] + TREES[Kind.TARS])
     with pytest.raises(ValueError, match="could be tars or freihand"):
@@ -82,7 +82,7 @@ def test_every_kind_has_its_source_and_says_when_it_needs_mano(kind, tmp_path):
     source = source_at(tmp_path, kind, split="test", mano="MANO_RIGHT.pkl")
     assert (source.root, source.split, source.mano) == (str(tmp_path), "test", "MANO_RIGHT.pkl")
     if kind not in (Kind.OAKINK, Kind.FREIHAND):
-        with pytest.raises(ValueError, match="give --mano MANO_RIGHT.pkl"):
+        with pytest.raises(ValueError, match=r"give --mano MANO_RIGHT\.pkl"):
             source_at(tmp_path, kind, split=None, mano=None)
 
 

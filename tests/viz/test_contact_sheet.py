@@ -57,9 +57,10 @@ def test_the_outline_is_that_of_the_projected_vertices(frame, faces):
     filled = np.zeros((TILE, TILE), np.uint8)
     contours, _ = cv2.findContours(white.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(filled, contours, -1, 1, -1)
-    inside = [filled[int(v), int(u)] for u, v in vertices]
-    assert np.mean(inside) > 0.97
-    assert filled.sum() < 1.6 * cv2.contourArea(cv2.convexHull(vertices.astype(np.float32)))
+    # Vertices on the silhouette lie up to a pixel beyond the outermost pixel centre that it covers.
+    widened = cv2.dilate(filled, np.ones((3, 3), np.uint8))
+    assert np.mean([widened[int(v), int(u)] for u, v in vertices]) > 0.99
+    assert 0.5 < filled.sum() / cv2.contourArea(cv2.convexHull(vertices.astype(np.float32))) < 1
 
 
 def test_a_mirrored_image_is_shown_mirrored(frame):
