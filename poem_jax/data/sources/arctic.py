@@ -112,10 +112,10 @@ class Arctic:
         sequence, number = self._sequences[which], int(self._first[which] + index - self._starts[which])
         key, path = f"{sequence}/{number:05d}", self._mano_path(sequence)
         rig = self._rigs[sequence.split("/")[0]]
-        labels = _read_hand(path, self._hand)
+        labels = _read_hand(path, self._hand, key)
         row = number - rig.ioi_offset
         pose = self._mano.add_mean(np.concatenate([labels.rot[row], labels.pose[row]]))
-        shape = labels.shape[row if len(labels.shape) > 1 else 0]
+        shape = labels.shape[row % len(labels.shape)]
         mesh = self._mano.mesh(pose, shape, labels.trans[row])
         views = hand_in_views(rig.T_cam_from_world, _joints(mesh), mesh.vertices, pose, shape)
         folder = self._folder / "images" / sequence
@@ -242,31 +242,30 @@ def _read_rigs(path: Path, subjects: set[str]) -> dict[str, _Rig]:
 
 def _count_rows(path: Path, hand: str) -> int:
     try:
-        return len(_read_hand(path, hand).rot)
+        return len(_read_hand(path, hand, path.name.partition(".")[0]).rot)
     except CorruptSampleError as error:
         raise ValueError(str(error)) from error
 
 
-@functools.lru_cache(maxsize=16)
-def _read_hand(path: Path, hand: str) -> _Hand:
-    """Return the labels of one hand of a sequence."""
-    sequence = path.name.removesuffix(".mano.npy")
+def _read_hand(path: Path, hand: str, key: str) -> _Hand:
+    """Return the labels of one hand of a sequence; sequences are kept, until their file changes."""
     try:
-        held = load_npy_dict(path).get(hand)
+        return _parse_hand(path, hand, path.stat().st_mtime_ns)
     except (ValueError, OSError) as error:
-        raise CorruptSampleError(path, sequence, str(error)) from error
+        raise CorruptSampleError(path, key, str(error)) from error
+
+
+@functools.lru_cache(maxsize=16)
+def _parse_hand(path: Path, hand: str, mtime_ns: int) -> _Hand:
+    held = load_npy_dict(path).get(hand)
     arrays = {}
     for name, numbers in _HAND_NUMBERS.items():
         value = held.get(name) if isinstance(held, dict) else None
         array = np.asarray([] if value is None else value)
         if array.dtype.kind not in "fiu" or array.ndim > 2 or array.size == 0 or array.shape[-1] != numbers:
-            raise CorruptSampleError(
-                path,
-                sequence,
-                f"`{hand}` must have `{name}` with rows of {numbers} numbers; got {array.shape}",
-            )
+            raise ValueError(f"`{hand}` must have `{name}` with rows of {numbers} numbers; got {array.shape}")
         arrays[name] = np.atleast_2d(array).astype(np.float32)
     rows = {len(arrays[name]) for name in ("rot", "pose", "trans")}
     if len(rows) > 1 or len(arrays["shape"]) not in (1, *rows):
-        raise CorruptSampleError(path, sequence, f"the fields of `{hand}` differ in their number of rows")
+        raise ValueError(f"the fields of `{hand}` differ in their number of rows")
     return _Hand(**arrays)
