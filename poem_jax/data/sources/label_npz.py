@@ -5,10 +5,10 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
+from poem_jax.io.npz_file import BinaryStream
 from poem_jax.typing import Array
 
 _MAX_HEADER = 4096
@@ -50,7 +50,7 @@ def _read_member(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) ->
     return array.astype(dtype.newbyteorder("="))
 
 
-def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _read_header(stream: BinaryStream) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"version {version} of NumPy's format is not read")
