@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from poem_jax.losses import PAPER, LossRecipe
-from poem_jax.models.config import ModelConfig, require
+from poem_jax.mixture.config import MixtureConfig
+from poem_jax.models.config import Config, DecoderOutput, ModelConfig, require
 from poem_jax.synthetic.config import SyntheticConfig
 
 
@@ -74,8 +75,15 @@ class DataConfig:
     """Batches drawn ahead in the background."""
     workers: int = 1
     """Threads that draw them."""
+    mixture: MixtureConfig | None = None
+    """Data sets to train on; None = synthetic captures alone. Validation stays with synthetic ones."""
 
     def __post_init__(self) -> None:
+        require(
+            self.mixture is None or all(shape.min_views is None for shape in self.batches),
+            "`min_views` of `data.batches` is for synthetic captures alone: with `data.mixture`, the `views` "
+            f"of its parts say how many views a sample has; got {self.batches}",
+        )
         require(
             sum(shape.weight for shape in self.batches) > 0,
             f"`data.batches` needs at least one shape with positive weight; got {self.batches}",
@@ -228,9 +236,19 @@ class TrainConfig:
             tuple(data.image_hw) == tuple(self.model.image_hw),
             f"`data.synthetic.image_hw` must be the model's {self.model.image_hw}; got {data.image_hw}",
         )
+        mixture = self.data.mixture
+        require(
+            mixture is None or not _predicts_parameters(self.model) or mixture.pose,
+            "a parametric model learns pose and shape; turn `data.mixture.pose` on",
+        )
+        require(
+            mixture is None or mixture.recipe.box_ratio == self.model.crop.ratio,
+            f"`data.mixture.recipe.box_ratio` must be the model's `crop.ratio`, {self.model.crop.ratio}; got "
+            f"{mixture and mixture.recipe.box_ratio}",
+        )
         require(
             not self.model.crop.upright,
-            "`model.crop.upright` is for models of upright hands; the synthetic captures are not turned",
+            "`model.crop.upright` is for models of upright hands; training crops are not turned upright",
         )
         require(
             not (self.frozen_views and self.first_stage_steps),
@@ -273,6 +291,10 @@ class TrainConfig:
         )
 
 
+def _predicts_parameters(model: ModelConfig) -> bool:
+    return isinstance(model, Config) and model.decoder.output is DecoderOutput.HAND_PARAMETERS
+
+
 BOOKKEEPING = (
     "train.steps",
     "train.out",
@@ -292,6 +314,8 @@ BOOKKEEPING = (
     "train.require_clean_commit",
     "data.prefetch",
     "data.workers",
+    "data.mixture.processes",
+    "data.mixture.max_corrupt_share",
 )
 """Fields that may change between two sittings of one run: they do not touch what is learned."""
 
@@ -330,6 +354,7 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
 
 
 _LATER = {
+    "data.mixture": None,
     "frozen_views": False,
     "model.joint_decoder": None,
     "model.backbone.frozen_norms": "none",

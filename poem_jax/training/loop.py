@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,7 +26,7 @@ from poem_jax.training.config import TrainConfig, git_commit
 from poem_jax.training.journal import Journal
 from poem_jax.training.parallel import Step, check_batch_sizes, compile_step, data_mesh, put_batch, replicated
 from poem_jax.training.preflight import check_before_training
-from poem_jax.training.source import BatchAt, synthetic_batches
+from poem_jax.training.source import BatchAt, open_training_data, training_batches
 from poem_jax.training.state import TrainState, create_state, restart_moments
 from poem_jax.training.step import Metrics
 from poem_jax.training.validation import Validation
@@ -43,28 +43,33 @@ def train(config: TrainConfig, *, batch_at: BatchAt | None = None) -> TrainState
 
     Args:
         config: the experiment.
-        batch_at: source of the batches by step; None = the config's synthetic captures.
+        batch_at: source of the batches by step; None = what `config.data` says.
 
     Returns:
         The last state.
 
     Raises:
+        FileNotFoundError: a data set of the config, or a file of it, is missing.
         FloatingPointError: a metric stopped being finite; names it and the step; no checkpoint is written.
         ModuleNotFoundError: an extra that the run needs is not installed.
         Stopped: SIGTERM or SIGINT came; the step under way and its checkpoint are finished.
-        ValueError: the run directory belongs to another config or cannot be written to, no checkpoint in it
-            can be read, or a batch cannot be split over the devices.
+        TooManyCorruptSamples: more of the data cannot be used than `data.mixture` allows.
+        ValueError: the run directory belongs to another config or was begun with other data files, it cannot
+            be written to, no checkpoint in it can be read, or a batch cannot be split over the devices.
+        WorkerDied: a data worker ended before its work did.
     """
     check_before_training(config)
     mesh = data_mesh()
     check_batch_sizes(config, mesh)
     run_dir = Path(config.train.out)
-    if batch_at is None:
-        batch_at = synthetic_batches(config.data)
-    with Checkpoints(run_dir, config) as checkpoints:
+    mixture = open_training_data(config) if batch_at is None else None
+    with (
+        Checkpoints(run_dir, config) as checkpoints,
+        training_batches(config, mixture) if batch_at is None else nullcontext(batch_at) as draw,
+    ):
         state = initial_state(config, checkpoints, mesh)
         first_step = int(state.step)
-        batches = draw_ahead(batch_at, first_step, ahead=config.data.prefetch, workers=config.data.workers)
+        batches = draw_ahead(draw, first_step, ahead=config.data.prefetch, workers=config.data.workers)
         with Journal(run_dir, config, first_step) as journal, stop_after_the_step() as stopped:
             run = _Run(config, mesh, checkpoints, journal, stopped)
             try:

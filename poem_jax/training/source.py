@@ -1,11 +1,16 @@
-"""Training batches: a pure function of the step."""
+"""Training batches: a pure function of the step, from synthetic captures or a mixture of data sets."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
 from poem_jax.batch import MultiViewBatch
 from poem_jax.data.batching import collate
+from poem_jax.mixture.files import check_files
+from poem_jax.mixture.samples import Mixture, open_mixture
+from poem_jax.mixture.stream import MixtureStream, host_rows
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.training.config import BatchShape, DataConfig, TrainConfig
 
@@ -13,6 +18,68 @@ BatchAt = Callable[[int], MultiViewBatch]
 
 _BATCH_STREAM = 1000
 """Third part of the seed of a batch's layout; the dataset's own streams of a sample are small numbers."""
+
+
+DATA_FILES = "data_files.json"
+"""In a run's folder: what identifies the files that it was begun with."""
+
+
+def open_training_data(config: TrainConfig) -> Mixture | None:
+    """Open the sources of the config's mixture, if it has one; before anything is written or compiled.
+
+    Raises:
+        FileNotFoundError: a root, a split's file, or MANO is missing.
+        ValueError: a source is empty, or its files are not what they should be.
+    """
+    if config.data.mixture is None:
+        return None
+    return open_mixture(
+        config.data.mixture,
+        synthetic=config.data.synthetic,
+        seed=config.data.seed,
+        image_hw=config.model.image_hw,
+    )
+
+
+@contextmanager
+def training_batches(config: TrainConfig, mixture: Mixture | None) -> Iterator[BatchAt]:
+    """Give the function from a step to its batch, for the run in `config.train.out`; workers end here.
+
+    Args:
+        config: the experiment.
+        mixture: its data, opened by `open_training_data`; None = synthetic captures.
+
+    Raises:
+        ValueError: the run was begun with other files.
+    """
+    if mixture is None or config.data.mixture is None:
+        yield synthetic_batches(config.data)
+        return
+    run_dir, options = Path(config.train.out), config.data.mixture
+    check_files(run_dir / DATA_FILES, mixture.fingerprint(), allow_change=config.train.allow_config_change)
+    with MixtureStream(
+        mixture,
+        processes=options.processes,
+        run_dir=run_dir,
+        max_corrupt_share=options.max_corrupt_share,
+    ) as stream:
+        yield mixture_batches(config.data, stream)
+
+
+def mixture_batches(config: DataConfig, stream: MixtureStream, *, host: int = 0, hosts: int = 1) -> BatchAt:
+    """Return the function from a step to this host's part of its batch.
+
+    A batch has as many views as its `BatchShape`; samples have as many as their part of the mixture draws, up
+    to that. Nothing but the step and the seed decides a batch.
+    """
+    largest = max(shape.batch_size for shape in config.batches)
+
+    def batch_at(step: int) -> MultiViewBatch:
+        shape = choose_shape(config, np.random.default_rng((config.seed, step, _BATCH_STREAM)))
+        rows = host_rows(step, shape.batch_size, largest, host=host, hosts=hosts)
+        return collate(stream.samples(rows, shape.num_views), shape.num_views)
+
+    return batch_at
 
 
 def synthetic_batches(config: DataConfig) -> BatchAt:

@@ -1,0 +1,106 @@
+"""A run whose samples come from a mixture: it learns in sittings, and knows the files that it began with."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.data.view_sampling import AllViews, UniformViews
+from poem_jax.mixture.config import CapturesSource, MixtureConfig, Part, SyntheticSource
+from poem_jax.training.config import BatchShape, differences, flatten_config
+from poem_jax.training.loop import train
+from poem_jax.training.source import mixture_batches, open_training_data, training_batches
+from tests.mixture.fake_frames import FakeFrames
+
+
+@pytest.fixture(autouse=True)
+def one_device(monkeypatch):
+    devices = jax.devices()[:1]
+    monkeypatch.setattr(jax, "devices", lambda *_: devices)
+
+
+@pytest.fixture
+def in_memory(monkeypatch):
+    """Captures come from no folder; its name is what identifies their file."""
+    monkeypatch.setattr(CapturesSource, "open", lambda source: FakeFrames(stamp=source.folders[0]))
+
+
+@pytest.fixture
+def config(micro_config):
+    mixture = MixtureConfig(
+        parts=(
+            Part(CapturesSource(("1",)), 0.75, UniformViews()),
+            Part(SyntheticSource(), 0.25, AllViews()),
+        ),
+        processes=0,
+    )
+    data = replace(micro_config.data, mixture=mixture, workers=2, batches=(BatchShape(3, 4),))
+    return replace(micro_config, data=data)
+
+
+def test_a_batch_depends_on_the_step_alone_and_hosts_share_it(config, in_memory):
+    with training_batches(config, open_training_data(config)) as batch_at:
+        batches = {step: batch_at(step) for step in (3, 0, 5)}
+    mixture = open_training_data(config)
+    with training_batches(config, mixture) as batch_at:
+        for step, batch in batches.items():
+            jax.tree.map(np.testing.assert_array_equal, batch_at(step), batch)
+            assert batch.views.shape == (4, 3, 32, 32, 3)
+            assert batch.cameras.view_mask.any(1).all()
+    stream = _Draws(mixture)
+    halves = [mixture_batches(config.data, stream, host=h, hosts=2)(3) for h in range(2)]
+    together = np.stack([half.joints_world for half in halves], 1).reshape(4, 21, 3)
+    np.testing.assert_array_equal(together, batches[3].joints_world)
+
+
+class _Draws:
+    def __init__(self, mixture):
+        self.mixture = mixture
+
+    def samples(self, positions, most_views):
+        return [self.mixture.draw(position, most_views).sample for position in positions]
+
+
+def test_a_run_from_a_mixture_goes_on_and_refuses_other_files(config, in_memory):
+    run = Path(config.train.out)
+    first = replace(config, train=replace(config.train, steps=2))
+    assert int(train(first).step) == 2
+    assert list(json.loads((run / "data_files.json").read_text()).values()) == [{"fake.tar": "1"}, {}]
+    (entry,) = json.loads((run / "data_report.json").read_text())
+    assert {"fake train", "synthetic captures"} == entry["sources"].keys()
+
+    parts = config.data.mixture.parts
+    other = (replace(parts[0], source=CapturesSource(("2",))), parts[1])
+    changed = replace(config, data=replace(config.data, mixture=replace(config.data.mixture, parts=other)))
+    changed = replace(changed, train=replace(changed.train, steps=2))
+    with pytest.raises(ValueError, match="holds a run of another config"):
+        train(changed)
+    (run / "data_files.json").write_text('{"fake train": {"fake.tar": "0"}, "synthetic captures": {}}')
+    with pytest.raises(ValueError, match=r"fake train: fake.tar: 0 -> 1.*allow-config-change"):
+        train(first)
+    allowed = replace(first, train=replace(first.train, allow_config_change=True))
+    assert int(train(allowed).step) == 2
+
+
+def test_missing_data_leave_no_run_behind(config, tmp_path):
+    parts = (Part(CapturesSource((str(tmp_path / "absent"),))),)
+    mixture = replace(config.data.mixture, parts=parts)
+    with pytest.raises(FileNotFoundError, match="absent"):
+        train(replace(config, data=replace(config.data, mixture=mixture)))
+    assert not Path(config.train.out).exists() or not any(Path(config.train.out).iterdir())
+
+
+def test_rules_of_a_run_from_a_mixture(config):
+    data = config.data
+    with pytest.raises(ValueError, match=r"`min_views` of `data.batches` is for synthetic captures alone"):
+        replace(data, batches=(BatchShape(3, 4, min_views=1),))
+    recipe = replace(data.mixture.recipe, box_ratio=1.5)
+    with pytest.raises(ValueError, match=r"must be the model's `crop.ratio`, 2.0; got 1.5"):
+        replace(config, data=replace(data, mixture=replace(data.mixture, recipe=recipe)))
+    more = replace(
+        config, data=replace(data, mixture=replace(data.mixture, processes=9, max_corrupt_share=1.0))
+    )
+    assert differences(flatten_config(config), flatten_config(more)) == []
