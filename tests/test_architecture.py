@@ -38,13 +38,16 @@ FLOORS = {
 WITHOUT_JAX = (
     "poem_jax",
     "poem_jax.batch",
+    "poem_jax.data.augmentation",
     "poem_jax.data.batching",
     "poem_jax.data.frames",
+    "poem_jax.data.view_sampling",
     "poem_jax.geometry.cameras",
     "poem_jax.geometry.transforms",
     "poem_jax.hand",
     "poem_jax.hand.model",
     "poem_jax.io.meshes",
+    "poem_jax.mixture.worker",
     "poem_jax.render.zbuffer",
     "poem_jax.synthetic.dataset",
 )

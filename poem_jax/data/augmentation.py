@@ -34,7 +34,6 @@ from poem_jax.data.pictures import (
     apply_gains,
     decode_shrunk,
     eighths_for,
-    mirror_about,
     warp,
 )
 from poem_jax.geometry.cameras import Cameras, anchor_to_primary, transform_pixels
@@ -77,8 +76,8 @@ def transform(
 ) -> MultiViewBatch:
     """Make the sample that given draws decide; arguments and errors as for `augment`.
 
-    Returns: a `MultiViewBatch` without batch axis: crops in uint8, all else in float32; `keypoints_px` are the
-        stored ones, moved with the pixels; `cameras` map from the first view's un-turned frame.
+    Returns: a `MultiViewBatch` without batch axis: crops in uint8, all else in float32; `keypoints_px` are
+        the stored ones, moved with the pixels; `cameras` map from the first view's un-turned frame.
     """
     views = np.asarray(views)
     squares = _squares(frame, views, recipe).moved(draws.shift, draws.scale)
@@ -86,7 +85,7 @@ def transform(
     crops = make(frame.K[views].astype(np.float64), squares, draws.angle, image_hw)
     images = [
         _crop_image(frame, view, row, squares, crops, draws, recipe, image_hw, using)
-        for row, view in enumerate(views)
+        for row, view in enumerate(views.tolist())
     ]
     pose, shape = frame.pose_cam, frame.shape
     return MultiViewBatch(
@@ -161,8 +160,8 @@ def _occlude(
     """Put noise where the patch lies wholly inside the image; the picture is changed."""
     height, width = picture.rgb.shape[:2]
     if mirror_px is not None:
-        right = transform_pixels(mirror_about(mirror_px - HALF_PIXEL), (box[:2] + [box[2], 0])[None])
-        box = np.array([*right[0], *box[2:]])
+        # Columns are counted by their left edges, so that the mirror of the right edge is the new left one.
+        box = np.array([2 * mirror_px - box[0] - box[2], *box[1:]])
     if (box[:2] < 0).any() or (box[:2] + box[2:] >= [width, height]).any():
         return picture
     left, top, columns, rows = box.astype(int)

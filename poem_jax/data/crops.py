@@ -70,7 +70,7 @@ def release_squares(points_px: Float[Array, "view point 2"], ratio: float) -> Sq
 def exact_crops(
     K: Float[Array, "view 3 3"], squares: Squares, angle: Float[Array, " view"], out_hw: tuple[int, int]
 ) -> Crops:
-    """Turn cameras by `angle` (radians, clockwise in the image), then crop squares whose centres turned along.
+    """Turn cameras by `angle` (radians, clockwise in the image), then crop squares that moved along.
 
     Args:
         K: of the whole images.

@@ -44,8 +44,9 @@ class UniformViews:
 @dataclass(frozen=True)
 class ReleaseNormalViews:
     """POEM v2's released rule: a rounded N(4, 2), held to `low` .. `high`, then to what there is, in random
-    order. Its evaluations with n views are `ReleaseNormalViews(n, n)`: order and primary view are random there
-    too.
+    order.
+
+    Its evaluations with n views are `ReleaseNormalViews(n, n)`: order and primary view are random there too.
     """
 
     low: int
