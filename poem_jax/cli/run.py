@@ -15,11 +15,12 @@ from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.inspect import Inspect
 from poem_jax.cli.messages import set_up_logging
+from poem_jax.cli.pack import Pack
 from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop_on_signals
 from poem_jax.cli.train import Train
 
-Command = Demo | Reconstruct | Fit | Detect | Inspect | Train | Eval | ImportTorch | ExportTorch
+Command = Demo | Reconstruct | Fit | Detect | Inspect | Train | Eval | ImportTorch | ExportTorch | Pack
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
@@ -30,6 +31,7 @@ _Commands = (
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[ImportTorch, tyro.conf.subcommand("import-torch")]
     | Annotated[ExportTorch, tyro.conf.subcommand("export-torch")]
+    | Annotated[Pack, tyro.conf.subcommand("pack")]
 )
 
 

@@ -7,8 +7,8 @@ sample). What its numbers mean depends on the data set; `CONVENTIONS` says it, a
   has one camera, which is the world.
 - `mano_pose` is zero for a flat hand (DexYCB, HO-3D, FreiHAND: their readers add MANO's mean pose, or the
   data set has none), or relative to MANO's mean pose (ARCTIC, InterHand2.6M: their readers give the stored
-  numbers to a layer with `flat_hand_mean` False). OakInk's released tars lack it. Zeros throughout stand for a pose
-  that is not known.
+  numbers to a layer with `flat_hand_mean` False). OakInk's released tars lack it. Zeros throughout stand
+  for a pose that is not known.
 - Pixels have their origin at the *centre* of the first pixel, as the tools with which these sets were
   calibrated: 0.5 is added to cx, cy, `joints_2d` and `bbox_center`.
 - `bbox_scale` is twice the side of the hand's box already, the recipes' ratio of 2.
