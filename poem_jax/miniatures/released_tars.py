@@ -194,7 +194,7 @@ def _label(name: str, frame: PlantedFrame, number: int, evaluates: bool) -> dict
         "bbox_scale": [np.float32(2 * side) for _, side in boxes],
         "joints_2d": _float32(joints_2d),
         "joints_3d": _float32(frame.joints_cam),
-        "joints_vis": _float32(visible),
+        "joints_vis": _float32(visible.astype(np.float32)),
         "joints_uvd": _float32(np.concatenate([joints_2d, frame.joints_cam[..., 2:]], axis=-1)),
         "verts_3d": _float32(frame.vertices_cam),
         "verts_uvd": _float32(np.concatenate([verts_2d, frame.vertices_cam[..., 2:]], axis=-1)),
