@@ -103,7 +103,7 @@ def report_of(tmp_path, drawn: int, bad: int, limit=0.01) -> DataReport:
 
 
 def test_corrupt_samples_are_named_in_log_and_report_and_stop_past_a_share(tmp_path, caplog):
-    report = report_of(tmp_path, 1000, bad=8)
+    report = report_of(tmp_path, 1000, bad=8, limit=0.05)
     assert caplog.text.count("corrupt sample of first passed over: /data/first.tar, sample frame") == 8
     report.write()
     (entry,) = json.loads(report.file.read_text())
