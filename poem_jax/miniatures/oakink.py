@@ -72,9 +72,10 @@ def write(root: Path, *, frames: int = 2, seed: int = 0) -> list[PlantedFrame]:
         for step in range(frames if number == 0 else 1):
             fid = sequence.first_frame + _STEP * step
             for person in range(sequence.people):
-                planted[sequence.place, person, fid] = _plant(
-                    (seed, 3, number, step, person), rig, sequence, fid
-                )
+                frame = _plant((seed, 3, number, step, person), rig, sequence, fid)
+                # Both people of a handover stand in one picture; only the giver's hand is drawn.
+                giver = planted.get((sequence.place, 0, fid), frame)
+                planted[sequence.place, person, fid] = frame._replace(images=giver.images)
         parts[sequence.place] = sequence.part
     for frame_id, frame in planted.items():
         _write_frame(image, frame_id, frame)
@@ -93,7 +94,6 @@ def _plant(seed: tuple[int, ...], rig: Rig, sequence: _Sequence, fid: int) -> Pl
 def _write_frame(image: Path, frame_id: tuple[str, int, int], frame: PlantedFrame) -> None:
     place, person, fid = frame_id
     for view, name in enumerate(VIEWS):
-        # Both people of a handover stand in one picture; only the giver's hand is drawn.
         if person == 0:
             save(image / "stream_release_v2" / place / f"{name}_{fid}.png", png(frame.images[view]))
         info = sample_name((place, person, fid, view))
