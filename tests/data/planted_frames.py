@@ -52,11 +52,11 @@ def planted_frame(views: int = 3, *, fx_over_fy: float = 1.1, skew: float = 0.0,
 
 
 def draw_blobs(points: np.ndarray) -> bytes:
-    """A PNG with a Gaussian blob, 3 pixels wide, about each point."""
+    """A PNG with a Gaussian blob, 1.5 pixels wide, about each point."""
     u, v = np.arange(SIZE_WH[0]) + 0.5, np.arange(SIZE_WH[1]) + 0.5
     image = np.zeros(SIZE_WH[::-1])
     for x, y in points[:20]:
-        image += np.exp(-(((u - x) ** 2)[None] + ((v - y) ** 2)[:, None]) / (2 * 3.0**2))
+        image += np.exp(-(((u - x) ** 2)[None] + ((v - y) ** 2)[:, None]) / (2 * 1.5**2))
     grey = np.repeat(np.round(200 * np.minimum(image, 1)).astype(np.uint8)[..., None], 3, -1)
     return cv2.imencode(".png", grey)[1].tobytes()
 

@@ -67,15 +67,15 @@ def test_the_releases_error_with_unequal_focal_lengths_is_as_stated(name):
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("name", RECIPES)
 def test_pictures_follow_the_key_points(name, mirrored):
-    recipe = dataclasses.replace(RECIPES[name], occlusion_probability=0.0)
+    recipe = dataclasses.replace(RECIPES[name], occlusion_probability=0.0, box_ratio=1.1)
     _, sample = sample_of(recipe, planted_frame(mirrored=mirrored), 1)
     found = 0
     for crop, points in zip(sample.views, sample.keypoints_px, strict=True):
         inside = (points > 10).all(-1) & (points < np.array(OUT_HW[::-1]) - 10).all(-1)
         for point in points[:20][inside[:20]]:
-            np.testing.assert_allclose(blob_near(crop, point), point, atol=0.12)
+            np.testing.assert_allclose(blob_near(crop, point), point, atol=0.1)
             found += 1
-    assert found > 40
+    assert found > 25
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -157,13 +157,13 @@ def test_patches_of_noise_lie_on_the_hand(mirrored):
         columns, rows = np.flatnonzero(changed.any(0)), np.flatnonzero(changed.any(1))
         # A square of 0.4 of the side, at the left or the right edge, half-way down.
         ends = [0, 64] if across == 0 else [96, 160]
-        np.testing.assert_allclose([columns[0], columns[-1] + 1], ends, atol=2.5)
-        np.testing.assert_allclose([rows[0], rows[-1] + 1], [48, 112], atol=2.5)
+        np.testing.assert_allclose([columns[0], columns[-1] + 1], ends, atol=6)
+        np.testing.assert_allclose([rows[0], rows[-1] + 1], [48, 112], atol=6)
         assert changed[rows[0] : rows[-1], columns[0] : columns[-1]].mean() > 0.95
 
 
 def test_patches_that_leave_the_image_are_left_out():
-    frame, recipe = planted_frame(1), dataclasses.replace(NONE, box_ratio=2.0)
+    frame, recipe = planted_frame(1), dataclasses.replace(NONE, box_ratio=4.0)
     draws = draw(recipe, 1, np.random.default_rng(0))
     outside = np.array([[0.16, 1.0, 0.5, 0.0]])  # the square reaches above the image
     pair = [
