@@ -27,6 +27,7 @@ from poem_jax.data.augmentation_recipes import (
 )
 from poem_jax.data.crops import Crops, Squares, exact_crops, exact_squares, release_crops, release_squares
 from poem_jax.data.frames import CorruptSampleError, MultiViewFrame
+from poem_jax.data.lens import stored_picture_map, take_picture
 from poem_jax.data.pictures import (
     EIGHTHS,
     Decoder,
@@ -133,7 +134,8 @@ def _crop_image(
     """Decode view `view` of the frame, the sample's number `row`, and make its crop."""
     image = frame.images[view]
     mirror_px = None if frame.mirror_px is None else float(frame.mirror_px[view])
-    shrinks = recipe.shrinks_while_decoding and not draws.occluded[row]
+    dist = None if frame.dist is None else frame.dist[view]
+    shrinks = recipe.shrinks_while_decoding and not draws.occluded[row] and dist is None
     scale = image_hw[1] / squares.side_px[row]
     try:
         picture = decode_shrunk(image, frame.size_wh[view], eighths_for(scale) if shrinks else EIGHTHS, using)
@@ -142,7 +144,13 @@ def _crop_image(
     if draws.occluded[row]:
         box = _patch_box(squares, draws, row)
         picture = _occlude(picture, box, mirror_px, np.random.default_rng(draws.noise_seed[row]))
-    crop = warp(picture, crops.H_crop_from_image[row], image_hw, mirror_px)
+    H_crop_from_image = crops.H_crop_from_image[row]
+    if dist is None:
+        crop = warp(picture, H_crop_from_image, image_hw, mirror_px)
+    else:
+        K = frame.K[view].astype(np.float64)
+        where = stored_picture_map(K, dist, mirror_px, H_crop_from_image @ K, image_hw, 1.0)
+        crop = take_picture(picture.rgb, where)
     return apply_gains(crop, draws.gains[row]) if (draws.gains[row] != 1).any() else crop
 
 

@@ -1,11 +1,15 @@
 """What a stored image shows of a view, through its lens and its mirror, lands where the labels say."""
 
+import cv2
 import numpy as np
 import pytest
 
+from poem_jax.data.augmentation import PAPER, RELEASE_V1, RELEASE_V2, draw, transform
+from poem_jax.data.frames import EncodedImage
 from poem_jax.data.lens import stored_picture_map, take_picture
-from poem_jax.geometry.cameras import crop_homography, transform_pixels
+from poem_jax.geometry.cameras import crop_homography, project_cam, transform_pixels
 from poem_jax.geometry.distortion import distort_pixels
+from tests.data.one_frame import one_frame
 
 K_STORED = np.array([[300.0, 0.7, 151], [0, 310, 126], [0, 0, 1]])
 DIST = np.array([-0.3, 0.05, -0.004, 0.004, 0.06])
@@ -38,3 +42,18 @@ def test_a_point_of_the_stored_image_lands_where_its_label_does(dist, mirror_px)
     where = stored_picture_map(K, dist, mirror_px, H @ K, (112, 112), 0.6)
     seen = centroid(take_picture(dot(raw[0]), where))
     assert np.allclose(seen, transform_pixels(H, ideal)[0], atol=0.15)
+
+
+@pytest.mark.parametrize("recipe", [PAPER, RELEASE_V1, RELEASE_V2])
+def test_augmented_crops_are_sampled_through_the_lens(recipe):
+    frame = one_frame(views=1, skew=0.0)
+    K = np.array([[[300.0, 0, 151], [0, 300, 126], [0, 0, 1]]])
+    target = project_cam(K, frame.joints_cam)
+    raw = distort_pixels(target[0, :1], K[0], DIST)
+    data = cv2.imencode(".png", dot(raw[0]))[1].tobytes()
+    frame = frame._replace(
+        K=K, keypoints_px=target, dist=DIST[None], images=(EncodedImage(data, "dot"),), box_px=None
+    )
+    draws = draw(recipe, 1, np.random.default_rng(1))._replace(occluded=np.array([False]))
+    sample = transform(frame, np.array([0]), draws, recipe, (192, 192))
+    assert np.allclose(centroid(sample.views[0]), sample.keypoints_px[0, 0], atol=0.2)
