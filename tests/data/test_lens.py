@@ -49,11 +49,14 @@ def test_augmented_crops_are_sampled_through_the_lens(recipe):
     frame = one_frame(views=1, skew=0.0)
     K = np.array([[[300.0, 0, 151], [0, 300, 126], [0, 0, 1]]])
     target = project_cam(K, frame.joints_cam)
-    raw = distort_pixels(target[0, :1], K[0], DIST)
-    data = cv2.imencode(".png", dot(raw[0]))[1].tobytes()
+    strong = np.array([8.0, 0, 0.03, 0.03, 0])
+    raw = distort_pixels(target[0], K[0], strong)
+    joint = np.linalg.norm(raw - target[0], axis=-1).argmax()
+    assert np.linalg.norm(raw[joint] - target[0, joint]) > 1
+    data = cv2.imencode(".png", dot(raw[joint]))[1].tobytes()
     frame = frame._replace(
-        K=K, keypoints_px=target, dist=DIST[None], images=(EncodedImage(data, "dot"),), box_px=None
+        K=K, keypoints_px=target, dist=strong[None], images=(EncodedImage(data, "dot"),), box_px=None
     )
     draws = draw(recipe, 1, np.random.default_rng(1))._replace(occluded=np.array([False]))
     sample = transform(frame, np.array([0]), draws, recipe, (192, 192))
-    assert np.allclose(centroid(sample.views[0]), sample.keypoints_px[0, 0], atol=0.2)
+    assert np.allclose(centroid(sample.views[0]), sample.keypoints_px[0, joint], atol=0.3)
