@@ -98,12 +98,11 @@ def test_a_picture_shrunk_while_decoding_lies_where_it_lay(eighths):
     assert picture.rgb.shape == (-(-61 * eighths // 8), -(-93 * eighths // 8), 3)
     assert picture.scale == eighths / 8
     H = np.array([[0.25, 0, 0], [0, 0.25, 0], [0, 0, 1]])
-    whole = cv2.GaussianBlur(decode(encoded(), (93, 61)), (0, 0), 2)
+    whole = cv2.GaussianBlur(decode(encoded(), (93, 61)), (0, 0), 1.2)
     expected = warp(Picture(whole, 1.0), H, (15, 23))[2:-2, 2:-2].astype(float)
     shrunk = warp(picture, H, (15, 23))[2:-2, 2:-2].astype(float)
-    assert np.abs(shrunk - expected).mean() < 4
     shifted = warp(picture, H + np.array([[0, 0, 0.5], [0, 0, 0], [0, 0, 0]]), (15, 23))[2:-2, 2:-2]
-    assert np.abs(shifted - expected).mean() > 8
+    assert 3 * np.abs(shrunk - expected).mean() < np.abs(shifted - expected).mean()
 
 
 def test_turned_images_and_pngs_are_not_shrunk():
