@@ -78,16 +78,15 @@ def test_pictures_of_a_flipped_sample_show_the_mirror_image_of_its_labels(miniat
     assert (right[2]["request_flip"], left[2]["request_flip"]) == (False, True)
     for (frame, _, _), flip in ((right, False), (left, True)):
         for view, image in enumerate(frame.images):
-            u, v = frame.keypoints_px[view].mean(0)
-            u = 2 * frame.K[view, 0, 2] - u if flip else u
-            assert is_skin(image, u, v)
+            uv = project_cam(frame.K[view], frame.vertices_cam[view])
+            mirror = np.stack([2 * frame.K[view, 0, 2] - uv[:, 0], uv[:, 1]], axis=-1)
+            assert (redness(image, mirror) > redness(image, uv)) == flip
 
 
-def is_skin(image, u, v):
-    """Red over blue about the middle of the hand, unlike most of the background, or grey."""
-    reach = max(image.shape) // 200
-    patch = image[int(v) - reach : int(v) + reach, int(u) - reach : int(u) + reach].reshape(-1, 3).mean(0)
-    return patch[0] >= patch[2]
+def redness(image, uv):
+    """Red less blue at pixels: skin has more of it than the background."""
+    columns, rows = np.clip(uv.astype(int), 0, np.array(image.shape[1::-1]) - 1).T
+    return (image[rows, columns, 0].astype(float) - image[rows, columns, 2]).mean()
 
 
 def test_the_box_is_that_of_the_key_points_but_for_two_cameras_of_ho3d_s_evaluation(miniature):
