@@ -34,14 +34,12 @@ test-browser: setup
 	@command -v chromium >/dev/null || { apt-get update -qq && apt-get install -y -qq chromium >/dev/null; }
 	$(BIN)/python -m pytest -m browser
 
-# Programs are compiled here as users' are: `make test` spares LLVM its dearest passes.
-AS_USERS := XLA_FLAGS=--xla_force_host_platform_device_count=2
-
+# Programs are compiled here as users' are; in the other suites LLVM optimises nothing.
 test-parity: setup
-	$(AS_USERS) $(PYTEST) -m parity --dist loadfile
+	XLA_FLAGS=--xla_force_host_platform_device_count=2 $(PYTEST) -m parity --dist loadfile
 
 test-slow: setup
-	$(AS_USERS) $(PYTEST) -m slow
+	$(PYTEST) -m slow
 
 lint: setup
 	$(BIN)/ruff check .

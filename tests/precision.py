@@ -1,4 +1,4 @@
-"""What the products of a traced program are computed in."""
+"""Comparisons in float64, and what the products of a traced program are computed in."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -24,3 +24,10 @@ def coarse_products(function: Callable, *args: Any) -> list[str]:
     full = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
     floats = (e for e in found if jnp.issubdtype(e.outvars[0].aval.dtype, jnp.floating))
     return [str(e.source_info.traceback) for e in floats if e.params["precision"] != full]
+
+
+def as_float64(tree: Any) -> Any:
+    """Return the tree with its floating leaves in float64; needs `jax.enable_x64(True)`."""
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float64 if jnp.issubdtype(x.dtype, jnp.floating) else None), tree
+    )

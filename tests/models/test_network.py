@@ -14,6 +14,7 @@ from poem_jax.hand.model import HandModel, hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.models.apply import _predict, apply, init
 from poem_jax.models.network import describe, forward, leaves_with_names
+from tests.precision import as_float64
 
 CONFIGS = ("micro_config", "joints_config", "parametric_config")
 METRES = 2e-5
@@ -230,7 +231,7 @@ def loss64(joints_config, make_params, make_scene):
     """
 
     def make():
-        params = jax.tree.map(_as64, make_params(joints_config))
+        params = as_float64(make_params(joints_config))
         views, cams = make_scene(2, 3)
 
         def loss(K, T, root):
@@ -239,16 +240,12 @@ def loss64(joints_config, make_params, make_scene):
             return jnp.sum(jnp.sin(30 * prediction.layers_world))
 
         inputs = [
-            _as64(jnp.asarray(x))
+            as_float64(jnp.asarray(x))
             for x in (cams.K, cams.T_cam_from_world, np.array([[0.01] * 3, [np.nan] * 3]))
         ]
         return jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2))), inputs
 
     return make
-
-
-def _as64(x):
-    return jnp.asarray(x, jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else jnp.asarray(x)
 
 
 @pytest.mark.slow
@@ -275,8 +272,8 @@ def test_gradients_through_apply_match_finite_differences(micro_config, make_par
     views, cams = make_scene(1, 3)
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
-        params = jax.tree.map(_as64, make_params(micro_config))
-        cams = Cameras(*(_as64(leaf) for leaf in cams))
+        params = as_float64(make_params(micro_config))
+        cams = as_float64(cams)
 
         def loss(cams):
             prediction = apply(params, views, cams, config=micro_config)
@@ -372,8 +369,8 @@ def test_other_views_are_a_set_exactly_in_float64(joints_config, make_params, ma
     views, cams = make_scene(2, 4)
     order = np.array([0, 2, 3, 1])
     with jax.enable_x64(True):
-        params = jax.tree.map(_as64, make_params(joints_config))
-        cams = Cameras(*map(_as64, cams))
+        params = as_float64(make_params(joints_config))
+        cams = as_float64(cams)
         run = jax.jit(lambda v, c: forward(params, v, c, config=joints_config)[0].layers_world)
         turned = run(jnp.asarray(views)[:, order], Cameras(*(x[:, order] for x in cams)))
         np.testing.assert_allclose(turned, run(jnp.asarray(views), cams), atol=1e-8)
