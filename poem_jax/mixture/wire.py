@@ -2,9 +2,29 @@
 
 import pickle
 import struct
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
+
+UNREADABLE = (
+    pickle.PickleError,
+    ArithmeticError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
+"""What a value raises that cannot be pickled, or a pickle whose classes are not those here."""
 
 _COUNT, _LENGTH = struct.Struct("<I"), struct.Struct("<Q")
+
+
+class Failure(NamedTuple):
+    """An error of a sample, in the place of the sample, for the run to raise.
+
+    Its home is not `worker.py`: a worker runs that as `__main__`, which is another module in the run.
+    """
+
+    error: Exception
 
 
 def send(pipe: BinaryIO, value: Any) -> None:

@@ -1,7 +1,7 @@
 """What a worker process runs: `python -m poem_jax.mixture.worker`, requests on stdin, samples on stdout.
 
-It ends when its stdin does, so that a run that was killed leaves nobody behind. What libraries print goes to
-stderr.
+It ends when its stdin does, and at nothing else: a run that was killed leaves nobody behind, and one that is
+asked to stop, by a signal to all its processes, can finish its step. What libraries print goes to stderr.
 """
 
 import os
@@ -9,18 +9,28 @@ import pickle
 import signal
 import sys
 import traceback
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import cv2
 
 from poem_jax.mixture.samples import Mixture
-from poem_jax.mixture.wire import receive, send
+from poem_jax.mixture.wire import UNREADABLE, Failure, receive, send
 
-
-class Failure(NamedTuple):
-    """An error of a sample, for the run to raise."""
-
-    error: Exception
+ERRORS_OF_SAMPLES = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    ImportError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    cv2.error,
+)
+"""What the run hears where the batch is asked for; any other error ends the worker, and the run with it."""
 
 
 def serve(requests: BinaryIO, replies: BinaryIO) -> None:
@@ -31,8 +41,7 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
             position, most_views = receive(requests)
             try:
                 reply = mixture.draw(position, most_views)
-            except Exception as error:
-                # Of any kind: the run raises it where the batch is asked for.
+            except ERRORS_OF_SAMPLES as error:
                 reply = Failure(_portable(error))
             send(replies, reply)
     except (EOFError, BrokenPipeError):
@@ -44,7 +53,7 @@ def _portable(error: Exception) -> Exception:
     place = "in a data worker:\n" + "".join(traceback.format_exception(error))
     try:
         copy = pickle.loads(pickle.dumps(error))
-    except Exception:
+    except UNREADABLE:
         # Exceptions may need arguments that they do not keep; their words are what counts.
         copy = RuntimeError(f"{type(error).__name__}: {error}")
     copy.add_note(place)
@@ -53,7 +62,8 @@ def _portable(error: Exception) -> Exception:
 
 def main() -> None:
     """Serve stdin and stdout."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for kind in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(kind, signal.SIG_IGN)
     cv2.setNumThreads(1)
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

@@ -17,8 +17,7 @@ from types import TracebackType
 from typing import IO
 
 from poem_jax.mixture.samples import Drawn, Mixture
-from poem_jax.mixture.wire import receive, send
-from poem_jax.mixture.worker import Failure
+from poem_jax.mixture.wire import UNREADABLE, Failure, receive, send
 
 _PATIENCE_S = 5.0
 """For a worker to end the sample at hand when the pool closes, before it is killed."""
@@ -114,8 +113,8 @@ class Workers:
             try:
                 send(process.stdin, (position, most_views))
                 reply = receive(process.stdout)
-            except Exception as error:
-                # Whatever it is, the batch that waits for the sample must hear of it.
+            except (EOFError, OSError, MemoryError, *UNREADABLE) as error:
+                # The batch that waits for the sample must hear of it.
                 if isinstance(error, EOFError | OSError):
                     error = WorkerDied(_obituary(number, process, position))
                 future.set_exception(error)

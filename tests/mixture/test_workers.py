@@ -1,6 +1,7 @@
 """Worker processes give what one process gives, and end with the run, whatever ends it."""
 
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from poem_jax.mixture import workers
 from poem_jax.mixture.samples import Mixture
 from poem_jax.mixture.workers import WorkerDied, Workers
 from tests.mixture.fakes import FakeSamples
@@ -92,14 +94,20 @@ def test_errors_of_samples_reach_who_asked_and_closing_waits_for_nothing_that_no
     assert any("fakes.py" in note for note in raised[0].__notes__)
 
 
-def test_a_mixture_that_cannot_be_sent_says_so_and_leaves_nobody_behind():
+def test_a_mixture_that_cannot_be_sent_says_so_and_leaves_nobody_behind(monkeypatch):
+    started = []
+    monkeypatch.setattr(
+        workers, "_start", lambda start=workers._start: started.append(start()) or started[-1]
+    )
     broken = mixture()
     broken.parts[0].name = lambda: "no name"
-    with pytest.raises(Exception, match="pickle"):
+    with pytest.raises((AttributeError, pickle.PicklingError), match="pickle"):
         Workers(broken, 1)
+    assert len(started) == 1
+    assert is_gone(started[0].pid)
 
 
-def test_workers_of_a_killed_run_end_by_themselves_and_ctrl_c_is_the_runs(tmp_path):
+def test_workers_of_a_killed_run_end_by_themselves_and_signals_are_the_runs():
     script = (
         "import os, time\n"
         "from poem_jax.mixture.workers import Workers\n"
@@ -115,6 +123,7 @@ def test_workers_of_a_killed_run_end_by_themselves_and_ctrl_c_is_the_runs(tmp_pa
     assert all(os.getpgid(pid) != os.getpgid(run.pid) for pid in ids)
     for pid in ids:
         os.kill(pid, signal.SIGINT)
+        os.kill(pid, signal.SIGTERM)
     time.sleep(0.2)
     assert not any(is_gone(pid) for pid in ids)
     run.kill()
