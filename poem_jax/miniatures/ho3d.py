@@ -13,7 +13,8 @@ are the second set of tip vertices. The last digit d of a sequence is its camera
 in OpenCV axes, is trans_{cam_orders[d]}.txt. Pixels have their origin at the centre of the first one.
 
 Training: ABF1 (five cameras) and a sequence of one camera, which the multi-view set leaves out. Test: GPMF1,
-whose pictures lie in `train`, and SB1, of which SB11 and SB13 lie in `evaluation`.
+whose pictures lie in `train`, and SB1, of which SB11 and SB13 lie in `evaluation`. The official evaluation
+set also has AP1 and MPM1 (five cameras) and SM1, whose one camera has no digit. The archive labels SB1 alone.
 """
 
 import pickle
@@ -50,39 +51,51 @@ CAMERAS = ("0", "1", "2", "3", "4")
 """Digits at the end of a sequence's name."""
 FIRST_CAMERA = 2
 _OPENGL = np.diag([1.0, -1.0, -1.0])
-_FRAME_NUMBERS = {"ABF1": 7, "GPMF1": 120, "SB1": 43, "SM2": 0}
+_FRAME_NUMBERS = {"ABF1": 7, "GPMF1": 120, "SB1": 43, "SM2": 0, "AP1": 11, "MPM1": 58, "SM1": 5}
 """Of each sequence's first frame."""
 _STEP = 3
 _HELD_OUT = ("SB11", "SB13")
-_CAMERA_ORDERS = {"ABF1": (1, 2, 0, 4, 3), "GPMF1": (0, 1, 2, 3, 4), "SB1": (3, 0, 4, 2, 1)}
+_EVALUATED = ("AP1", "MPM1")
+"""Whose every camera is held out."""
+_CAMERA_ORDERS = {
+    "ABF1": (1, 2, 0, 4, 3),
+    "GPMF1": (0, 1, 2, 3, 4),
+    "SB1": (3, 0, 4, 2, 1),
+    "AP1": (2, 0, 1, 4, 3),
+    "MPM1": (4, 3, 1, 0, 2),
+}
 _BOX_MARGIN_PX = 10
 
 
 def write(root: Path, *, frames: int = 2, seed: int = 0, version: str = "v3") -> list[PlantedFrame]:
-    """Write a tiny HO-3D below `root` and return its multi-view frames: train, then test.
+    """Write a tiny HO-3D below `root` and return its multi-view frames: train, then test, then those of the
+    official evaluation set that are not in test (AP1, MPM1, SM1).
 
     Args:
         root: the folder that will hold `HO3D_<version>` and, for v3, `HO3D_v3_manual_test_gt`.
-        frames: of ABF1 and of SB1; GPMF1 has one.
+        frames: of ABF1 and of SB1; the others have one.
         seed: of all chance.
         version: "v2" or "v3".
     """
     data = Path(root) / f"HO3D_{version}"
     listed: dict[str, list[tuple[str, PlantedFrame, int]]] = {"train": [], "evaluation": []}
     planted = []
-    for number, (main, count) in enumerate({"ABF1": frames, "GPMF1": 1, "SB1": frames}.items()):
+    counts = {"ABF1": frames, "GPMF1": 1, "SB1": frames, **dict.fromkeys(_EVALUATED, 1)}
+    for number, (main, count) in enumerate(counts.items()):
         rig = draw_rig((seed, 30, number), CAMERAS, SIZE_WH)
         shown = _plant(rig, main, count, (seed, 31, number))
         planted += [_as_listed(frame) for frame in shown.values()]
         for view, digit in enumerate(CAMERAS):
-            split = "evaluation" if main + digit in _HELD_OUT else "train"
+            split = "evaluation" if main in _EVALUATED or main + digit in _HELD_OUT else "train"
             listed[split] += [(f"{main}{digit}/{name}", frame, view) for name, frame in shown.items()]
         if version == "v3":
             _write_calibration(data / "calibration" / main / "calibration", rig, _CAMERA_ORDERS[main])
             _write_manual(root, data, main, shown)
-    alone = draw_rig((seed, 32), ("0",), SIZE_WH)
-    for name, frame in _plant(alone, "SM2", 1, (seed, 33)).items():
-        listed["train"].append((f"SM2/{name}", frame, 0))
+    for number, (main, split) in enumerate({"SM2": "train", "SM1": "evaluation"}.items()):
+        alone = draw_rig((seed, 32, number), (main,), SIZE_WH)
+        for name, frame in _plant(alone, main, 1, (seed, 33, number)).items():
+            listed[split].append((f"{main}/{name}", frame, 0))
+            planted += [frame] if split == "evaluation" else []
     for split, lines in listed.items():
         save(data / f"{split}.txt", "".join(f"{line}\n" for line, _, _ in lines).encode())
         for line, frame, view in lines:

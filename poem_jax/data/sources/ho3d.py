@@ -20,14 +20,18 @@ Splits:
 - `evaluation`: the official evaluation set, single views with the set's boxes. The authors published its
   labels in November 2024: `evaluation_xyz.json` and `evaluation_verts.json`, OpenGL axes, MANO's joint order,
   in the order of `evaluation.txt`; their `eval.py` scores predictions in the same form.
+- `evaluation-mv`: the same images, labels and boxes in multi-view frames: those of AP1, MPM1 and SB1 (of
+  which it has cameras 1 and 3) in the order of views above, whichever are there; SM1 has one camera, which is
+  the world.
 
-Extrinsics come from `calibration`; without it (v2) from the labels, which are the same hand in all views.
+Extrinsics come from `calibration`: v2 has none of its own, and takes that of `HO3D_v3` beside it, the
+recordings being the same. Without that they come from the labels, which are one hand in all views; the log
+says so.
 """
 
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +39,7 @@ from poem_jax.data.frames import MultiViewFrame, check_frame
 from poem_jax.data.sources.hand_in_views import ManoFile, span_intrinsics, span_pixels
 from poem_jax.data.sources.ho3d_calibration import Calibration, align_labels
 from poem_jax.data.sources.ho3d_labels import ADVICE, HeldOutLabels, ViewLabel, read_view
+from poem_jax.data.sources.ho3d_lists import VIEW_ORDER, Member, group_views, read_list
 from poem_jax.data.sources.raw_sets import (
     check_choice,
     check_count,
@@ -48,29 +53,16 @@ from poem_jax.geometry.cameras import project_cam
 from poem_jax.typing import Array, Float
 
 MAIN_SEQUENCES = {"train": ("ABF1", "BB1", "GSF1", "MDF1", "SiBF1"), "test": ("GPMF1", "SB1")}
-SPLITS = ("train", "test", "evaluation")
-VIEW_ORDER = (2, 0, 1, 3, 4)
-"""Cameras; the first faces the wall and is the constant master."""
+SPLITS = ("train", "test", "evaluation", "evaluation-mv")
+_LISTS = {"train": ("train",), "test": ("train", "evaluation")}
+"""Of a split; the last two splits have but `evaluation`."""
 PAPER_COUNTS = {("v3", "train"): 9_087, ("v3", "test"): 2_706}
 EVALUATION_COUNTS = {"v2": 11_524, "v3": 20_137}
-"""Of the official sets, as the authors' `vis_utils.py` states them."""
+"""Images of the official sets, as the authors' `vis_utils.py` states them."""
 WIDTH, HEIGHT = 640, 480
 _SUFFIXES = {"v2": (".png", ".jpg"), "v3": (".jpg", ".png")}
 
 _log = logging.getLogger(__name__)
-
-
-class Member(NamedTuple):
-    """One view of a frame."""
-
-    listed_in: str
-    """"train" or "evaluation": the folder, and the list, that hold it."""
-    sequence: str
-    frame: str
-    row: int
-    """In the list."""
-    place: int
-    """Among the list's lines of this sequence."""
 
 
 class HO3D:
@@ -90,7 +82,7 @@ class HO3D:
 
         Args:
             root: The folder `HO3D_v3` (or `HO3D_v2`), or the one that holds it.
-            split: "train", "test" or "evaluation".
+            split: "train", "test", "evaluation" or "evaluation-mv".
             version: "v2" or "v3".
             mano: The user's `MANO_RIGHT.pkl`.
             held_out: Folder of the labels of evaluation images; None looks within and beside the set.
@@ -109,27 +101,27 @@ class HO3D:
         self.max_views = 1 if split == "evaluation" else len(VIEW_ORDER)
         self._version, self._split = version, split
         self._mano = ManoFile.open(mano)
-        lists = {"train": ("train",), "test": ("train", "evaluation"), "evaluation": ("evaluation",)}[split]
+        lists = _LISTS.get(split, ("evaluation",))
         self._lists = [need_file(self.root / f"{n}.txt", "a list of samples", advice=ADVICE) for n in lists]
-        members = [member for path in self._lists for member in _read_list(path)]
-        if split == "evaluation":
+        members = [member for path in self._lists for member in read_list(path)]
+        if split in MAIN_SEQUENCES:
+            members = [member for member in members if _is_view_of(member, MAIN_SEQUENCES[split])]
+            self._held_out = self._find_held_out(members, held_out)
+            if self._held_out is None:
+                members = [member for member in members if member.listed_in == "train"]
+            self._frames = self._with_master(group_views(members))
+            check_count(self.name, len(self), PAPER_COUNTS.get((version, split)), strict=strict_counts)
+        else:
             self._held_out = HeldOutLabels.find(self.root, version, held_out, need="official")
-            self._frames = [(member,) for member in members]
-            check_count(self.name, len(self), EVALUATION_COUNTS[version], strict=strict_counts)
-            return
-        members = [member for member in members if _is_view_of(member, MAIN_SEQUENCES[split])]
-        self._held_out = self._find_held_out(members, held_out)
-        if self._held_out is None:
-            members = [member for member in members if member.listed_in == "train"]
-        self._frames = self._group(members)
-        mains = sorted({frame[0].sequence[:-1] for frame in self._frames})
-        self._calibrations = {main: Calibration.read(self.root, main) for main in mains}
-        if version == "v3" and (missing := [main for main, found in self._calibrations.items() if not found]):
-            folder = self.root / "calibration" / missing[0]
-            raise FileNotFoundError(
-                f"the calibration of {missing[0]} is missing: expected {folder}. {ADVICE}"
+            self._frames = [(m,) for m in members] if split == "evaluation" else group_views(members)
+            check_count(
+                f"{self.name}: its list",
+                len(members),
+                EVALUATION_COUNTS[version],
+                strict=strict_counts,
+                counted_by="the set's own count is",
             )
-        check_count(self.name, len(self), PAPER_COUNTS.get((version, split)), strict=strict_counts)
+        self._calibrations = {} if split == "evaluation" else self._find_calibrations()
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -142,7 +134,7 @@ class HO3D:
         """
         members = self._frames[index]
         first = members[0]
-        key = f"{first.sequence if len(members) == 1 else first.sequence[:-1]}/{first.frame}"
+        key = f"{first.sequence if self._split == 'evaluation' else first.main}/{first.frame}"
         folder = self.root / first.listed_in / first.sequence
         labels = [self._read_label(member, key) for member in members]
         joints = np.stack([label.joints_cam for label in labels])
@@ -153,7 +145,7 @@ class HO3D:
             MultiViewFrame(
                 key=key,
                 images=tuple(read_image(self._image_path(member), key) for member in members),
-                view_names=tuple(member.sequence[-1] for member in members),
+                view_names=tuple(member.view_name for member in members),
                 size_wh=np.tile([WIDTH, HEIGHT], (len(members), 1)),
                 K=K,
                 T_cam_from_world=self._extrinsics(members, joints, key),
@@ -188,20 +180,35 @@ class HO3D:
             _log.warning("%s: %d views are left out: %s", self.name, count, error)
             return None
 
-    def _group(self, members: list[Member]) -> list[tuple[Member, ...]]:
-        """Return frames in first-seen order, each with its views in the set's order."""
-        groups: dict[tuple[str, str], dict[int, Member]] = {}
-        for member in members:
-            views = groups.setdefault((member.sequence[:-1], member.frame), {})
-            views[int(member.sequence[-1])] = member
-        frames = [tuple(views[d] for d in VIEW_ORDER if d in views) for views in groups.values()]
-        kept = [frame for frame in frames if frame and int(frame[0].sequence[-1]) == VIEW_ORDER[0]]
+    def _with_master(self, frames: list[tuple[Member, ...]]) -> list[tuple[Member, ...]]:
+        """Return the frames that the first camera shows."""
+        kept = [frame for frame in frames if frame[0].camera == VIEW_ORDER[0]]
         if len(kept) < len(frames):
             _log.warning(
                 "%s: %d frames are left out, as they lack camera %d, which comes first",
                 *(self.name, len(frames) - len(kept), VIEW_ORDER[0]),
             )
         return kept
+
+    def _find_calibrations(self) -> dict[str, Calibration | None]:
+        """Return those of the recordings with several cameras, by main sequence."""
+        firsts = (frame[0] for frame in self._frames)
+        mains = sorted({member.main for member in firsts if member.camera is not None})
+        folders = [self.root / "calibration"]
+        if self._version == "v2":
+            folders += [self.root.parent / name / "calibration" for name in ("HO3D_v3", "HO-3D_v3")]
+        found = {main: Calibration.find(folders, main) for main in mains}
+        missing = [main for main, calibration in found.items() if calibration is None]
+        if missing and self._version == "v3":
+            raise FileNotFoundError(
+                f"the calibration of {missing[0]} is missing: expected {folders[0] / missing[0]}. {ADVICE}"
+            )
+        if missing:
+            _log.warning(
+                "%s: the extrinsics of %s are made from the labels, as there is no calibration in %s",
+                *(self.name, ", ".join(missing), " or ".join(str(folder) for folder in folders)),
+            )
+        return found
 
     def _read_label(self, member: Member, key: str) -> ViewLabel:
         path = self.root / member.listed_in / member.sequence / "meta" / f"{member.frame}.pkl"
@@ -213,12 +220,13 @@ class HO3D:
     def _extrinsics(
         self, members: tuple[Member, ...], joints_cam: Float[Array, "view 21 3"], key: str
     ) -> Float[Array, "view 4 4"]:
-        if self._split == "evaluation":
+        digits = [member.camera for member in members if member.camera is not None]
+        if self._split == "evaluation" or not digits:
             return np.eye(4)[None]
-        main, digits = members[0].sequence[:-1], [int(member.sequence[-1]) for member in members]
-        calibration = self._calibrations[main]
+        first = members[0]
+        calibration = self._calibrations[first.main]
         if calibration is None:
-            return align_labels(joints_cam, self.root / members[0].listed_in / main, key)
+            return align_labels(joints_cam, self.root / first.listed_in / first.sequence, key)
         return calibration.extrinsics(digits, joints_cam, key)
 
     def _image_path(self, member: Member) -> Path:
@@ -228,18 +236,7 @@ class HO3D:
 
 
 def _is_view_of(member: Member, mains: tuple[str, ...]) -> bool:
-    return member.sequence[:-1] in mains and member.sequence[-1].isdigit()
-
-
-def _read_list(path: Path) -> list[Member]:
-    members, places = [], {}
-    for row, line in enumerate(path.read_text(encoding="utf-8").split()):
-        sequence, slash, frame = line.partition("/")
-        if not slash or not (sequence.isalnum() and frame.isdigit()):
-            raise ValueError(f"{path} must have one SEQUENCE/FRAME per line; line {row + 1} is {line[:60]!r}")
-        places[sequence] = places.get(sequence, -1) + 1
-        members.append(Member(path.stem, sequence, frame, row, places[sequence]))
-    return members
+    return member.main in mains and member.camera is not None
 
 
 def _stacked(values: list[Array | None]) -> Array | None:

@@ -8,6 +8,7 @@ release's reading is kept unless the hands of the views do not meet under it, an
 """
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,15 +38,20 @@ class Calibration(NamedTuple):
     """Of `trans_0.txt` to `trans_4.txt`."""
 
     @classmethod
-    def read(cls, root: Path, main: str) -> "Calibration | None":
-        """Return the calibration of a sequence without its digit, or None where its folder is missing.
+    def find(cls, folders: Sequence[Path], main: str) -> "Calibration | None":
+        """Return the calibration of a sequence without its digit, or None where there is none.
+
+        Args:
+            folders: Each a `calibration`, as the set has it; the first that has the sequence is taken.
+            main: The sequence.
 
         Raises:
             FileNotFoundError: A file of it is missing.
             ValueError: A file of it is damaged.
         """
-        folder = root / "calibration" / main / "calibration"
-        if not folder.is_dir():
+        places = (folder / main / "calibration" for folder in folders)
+        folder = next((place for place in places if place.is_dir()), None)
+        if folder is None:
             return None
         orders = _numbers(folder / "cam_orders.txt", NUM_CAMERAS)
         if sorted(orders) != list(range(NUM_CAMERAS)):

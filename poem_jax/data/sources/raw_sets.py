@@ -13,9 +13,8 @@ from poem_jax.typing import Array, Float
 
 MAX_IMAGE_BYTES = 2**26
 """64 MiB; the images of the public sets have up to 8."""
-_SHARE_OF_PAPER = 0.5
-"""With fewer frames than this share of the paper's, a copy is a part of the set: its count tells nothing."""
-_MAX_APART_M = 0.02
+_SHARE_OF_WHOLE = 0.5
+"""With fewer frames than this share of the whole, a copy is a part of the set: its count tells nothing."""
 
 _log = logging.getLogger(__name__)
 
@@ -65,22 +64,47 @@ def check_choice(
         raise ValueError(f"`{name}` must be one of {', '.join(choices)}; got {value!r}{reason}")
 
 
-def check_count(name: str, found: int, paper: int | None, *, strict: bool) -> None:
-    """Compare the number of frames with the paper's; parts of a set (less than half) are let pass.
+def numbers(value: object, shape: tuple[int, ...], where: str) -> Float[Array, "..."]:
+    """Return what a calibration file says as an array.
+
+    Args:
+        value: Lists of numbers, or whatever stands in their place.
+        shape: That it must have, but for axes of length one.
+        where: File and field, for the message.
+
+    Raises:
+        ValueError: It is no such array, or not finite.
+    """
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where} must be numbers of shape {shape}; {error}") from error
+    if [n for n in array.shape if n != 1] != [n for n in shape if n != 1]:
+        raise ValueError(f"{where} must have shape {shape}; got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{where} must be finite; it is not")
+    return array.reshape(shape)
+
+
+def check_count(
+    name: str, found: int, expected: int | None, *, strict: bool, counted_by: str = "the paper counts"
+) -> None:
+    """Compare the number of frames with that of a whole set; parts of one (less than half) are let pass.
 
     Args:
         name: Of the source.
         found: Frames in it.
-        paper: Frames in the paper; None = not known.
+        expected: Frames in the whole set; None = not known.
         strict: Raise instead of a warning, and whatever the number.
+        counted_by: Who counted those that are expected, and a verb, for the message.
 
     Raises:
         ValueError: `strict`, and the counts differ.
     """
-    if paper is None or found == paper or (not strict and found < _SHARE_OF_PAPER * paper):
+    if expected is None or found == expected or (not strict and found < _SHARE_OF_WHOLE * expected):
         return
     message = (
-        f"{name} has {found} frames, and the paper counts {paper}: files may be missing, or the set is of "
+        f"{name} has {found} frames, and {counted_by} {expected}: files may be missing, or the set is of "
         "another release"
     )
     if strict:
@@ -89,23 +113,36 @@ def check_count(name: str, found: int, paper: int | None, *, strict: bool) -> No
 
 
 def check_mesh(
-    mesh_joints: Float[Array, "view 21 3"], joints: Float[Array, "view 21 3"], path: Path, key: str
+    mesh_joints: Float[Array, "view 21 3"],
+    joints: Float[Array, "view 21 3"],
+    path: Path,
+    key: str,
+    *,
+    max_apart_m: float = 0.02,
 ) -> None:
     """Insist that the skeleton of a mesh is that of the labels; finger tips, which sets define otherwise, may
     differ.
 
+    Args:
+        mesh_joints: Of MANO, metres.
+        joints: As labelled, in the same frame.
+        path: File of the labels, for the message.
+        key: Of the sample, for the message.
+        max_apart_m: Bound on the distance of a joint from its label; sets whose joints were not made by MANO
+            need more.
+
     Raises:
-        CorruptSampleError: They are further than 2 cm apart: labels that are wrong, or another MANO file or
-            convention than those of the set.
+        CorruptSampleError: They are further apart: labels that are wrong, or another MANO file or convention
+            than those of the set.
     """
     skeleton = list(SKELETON_FROM_OPENPOSE)
     apart = np.linalg.norm(mesh_joints[:, skeleton] - joints[:, skeleton], axis=-1).max()
     # Written so that NaN fails too.
-    if not apart <= _MAX_APART_M:
+    if not apart <= max_apart_m:
         raise CorruptSampleError(
             path,
             key,
-            f"MANO's joints lie up to {apart:.3g} m from the labelled ones; expected at most {_MAX_APART_M}. "
+            f"MANO's joints lie up to {apart:.3g} m from the labelled ones; expected at most {max_apart_m}. "
             "If all samples fail, the MANO file is not the one that the set was labelled with",
         )
 

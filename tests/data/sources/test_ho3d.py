@@ -1,7 +1,9 @@
 """HO-3D: cameras, axes and held-out views of a planted hand; both readings of `cam_orders.txt`."""
 
+import json
 import logging
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -94,6 +96,54 @@ def test_the_official_evaluation_set_is_single_views(tmp_path, mano):
         assert_is_planted(source[i], planted, [camera], pose=False)
 
 
+def test_the_official_evaluation_set_has_multi_view_frames_too(tmp_path, mano):
+    planted = write_ho3d(tmp_path / "HO3D_v3")
+    write_ho3d_official(tmp_path / "HO3D_v3", planted)
+    source = HO3D(tmp_path, mano=mano, split="evaluation-mv")
+    assert (len(source), source.max_views) == (1, 5)
+    frame = source[0]
+    assert (frame.key, frame.view_names) == ("SB1/0043", ("1", "3"))
+    assert_is_planted(frame, planted, [1, 3], pose=False)
+    np.testing.assert_array_equal(frame.box_px, [[100.5, 80.5, 200.5, 160.5]] * 2)
+    with pytest.raises(ValueError, match="2 frames, and the set's own count is 20137"):
+        HO3D(tmp_path, mano=mano, split="evaluation-mv", strict_counts=True)
+
+
+@pytest.mark.parametrize("split", ["evaluation", "evaluation-mv"])
+def test_a_recording_of_one_camera_is_the_world_and_has_no_digit(tmp_path, mano, split):
+    root = tmp_path / "HO3D_v3"
+    planted = write_ho3d(root)
+    write_ho3d_official(root, planted)
+    shutil.copytree(root / "evaluation" / "SB13", root / "evaluation" / "SM1")
+    with (root / "evaluation.txt").open("a") as stream:
+        stream.write("\nSM1/0043")
+    for path in root.glob("evaluation_*.json"):
+        rows = json.loads(path.read_text())
+        path.write_text(json.dumps([*rows, rows[1]]))
+    source = HO3D(tmp_path, mano=mano, split=split)
+    frame = source[len(source) - 1]
+    assert (frame.key, frame.view_names) == ("SM1/0043", ("SM1",))
+    np.testing.assert_array_equal(frame.T_cam_from_world, np.eye(4)[None])
+    assert_is_planted(frame, planted, [3], pose=False)
+
+
+@pytest.mark.parametrize("split", ["test", "evaluation-mv"])
+def test_v2_takes_the_calibration_of_v3_beside_it(tmp_path, mano, caplog, split):
+    root = tmp_path / "HO3D_v2"
+    planted = write_ho3d(root, calibration=False)
+    write_ho3d_official(root, planted)
+    views = ORDER if split == "test" else [1, 3]
+    with caplog.at_level(logging.WARNING):
+        alone = HO3D(tmp_path, mano=mano, split=split, version="v2")[0]
+    assert any("extrinsics of SB1 are made from the labels" in message for message in caplog.messages)
+    np.testing.assert_array_equal(alone.T_cam_from_world[0], np.eye(4))
+    caplog.clear()
+    write_ho3d(tmp_path / "HO3D_v3", authors=False)
+    beside = HO3D(tmp_path, mano=mano, split=split, version="v2")[0]
+    assert not any("made from the labels" in message for message in caplog.messages)
+    np.testing.assert_allclose(beside.T_cam_from_world, planted.T_cam_from_world[views], atol=1e-6)
+
+
 def test_labels_of_another_image_are_refused(tmp_path, mano):
     planted = write_ho3d(tmp_path)
     write_ho3d_official(tmp_path, planted._replace(joints_cam=planted.joints_cam[::-1]))
@@ -136,6 +186,9 @@ def test_missing_and_damaged_lists_are_named(tmp_path, mano):
         HO3D(tmp_path, mano=mano, split="test")
     (tmp_path / "train.txt").write_text("ABF10/0007\n../../secret/0001\n")
     with pytest.raises(ValueError, match="line 2"):
+        HO3D(tmp_path, mano=mano)
+    (tmp_path / "train.txt").write_bytes(b"ABF10/0007\xff")
+    with pytest.raises(ValueError, match=r"train\.txt must have .* no text"):
         HO3D(tmp_path, mano=mano)
     with pytest.raises(FileNotFoundError, match=r"train\.txt"):
         HO3D(tmp_path / "train", mano=mano)
