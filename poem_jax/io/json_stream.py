@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 _CHUNK = 2**20
-_MAX_VALUE = 2**26
+MAX_VALUE = 2**26
 """Characters of one value: a bound on what a damaged file makes us hold."""
 _SPACE = " \t\n\r"
 _SHOWN = 40
@@ -31,19 +31,33 @@ def stream_entries(path: str | Path, depth: int) -> Iterator[tuple[tuple[str, ..
             number that is not finite, or a value of more than 64 million characters.
     """
     with _opened(path) as stream:
-        walk = _Walk(stream, str(path))
+        walk = _Walk(stream, str(path), MAX_VALUE)
         yield from _entries(walk, depth, ())
         walk.end()
 
 
-def stream_list(path: str | Path, key: str) -> Iterator[Any]:
-    """Yield the elements of the list that a file's top object has under `key`, and read no further.
+def stream_list(
+    path: str | Path, key: str | None = None, *, max_value: int = MAX_VALUE, allow_nan: bool = False
+) -> Iterator[Any]:
+    """Yield the elements of a list.
+
+    Args:
+        path: A file that holds a list, or an object with one.
+        key: The list is what the top object has under this key, and is read no further than its end. None:
+            the file is the list.
+        max_value: Characters that an element may take; several times as many may be held.
+        allow_nan: Read `NaN` and `Infinity`, which Python writes though JSON has no such numbers; only for
+            readers that check every number themselves.
 
     Raises:
         FileNotFoundError, ValueError: As `stream_entries`, or there is no such key.
     """
     with _opened(path) as stream:
-        walk = _Walk(stream, str(path))
+        walk = _Walk(stream, str(path), max_value, allow_nan=allow_nan)
+        if key is None:
+            yield from walk.elements()
+            walk.end()
+            return
         for name in walk.object_keys():
             if name == key:
                 yield from walk.elements()
@@ -74,10 +88,10 @@ def _refuse_constant(text: str) -> None:
 class _Walk:
     """A place in a JSON text, and a window of characters from there on."""
 
-    def __init__(self, stream: TextIO, source: str):
-        self._stream, self._source = stream, source
+    def __init__(self, stream: TextIO, source: str, max_value: int, *, allow_nan: bool = False):
+        self._stream, self._source, self._max_value = stream, source, max_value
         self._text, self._at, self._before, self._ended = "", 0, 0, False
-        self._decoder = json.JSONDecoder(parse_constant=_refuse_constant)
+        self._decoder = json.JSONDecoder(parse_constant=None if allow_nan else _refuse_constant)
 
     def object_keys(self) -> Iterator[str]:
         """Go into an object; at each key the caller takes or skips the value."""
@@ -121,8 +135,8 @@ class _Walk:
                 if end < len(self._text) or self._ended:
                     self._at = end
                     return value
-            if len(self._text) - self._at > _MAX_VALUE:
-                raise self._problem(f"one value takes more than {_MAX_VALUE} characters, or is no JSON")
+            if len(self._text) - self._at > self._max_value:
+                raise self._problem(f"one value takes more than {self._max_value} characters, or is no JSON")
             self._more(max(_CHUNK, len(self._text) - self._at))
 
     def skip(self) -> None:

@@ -34,6 +34,42 @@ def test_a_list_is_found_behind_other_keys(tmp_path: Path):
         list(stream_list(path, "nothing"))
 
 
+@pytest.mark.parametrize("chunk", [1, 7, 64, 2**20])
+@pytest.mark.parametrize("indent", [None, 1])
+def test_a_file_that_is_a_list_is_read_in_pieces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int, indent: int | None
+):
+    monkeypatch.setattr(json_stream, "_CHUNK", chunk)
+    rows = [[i + 0.5, -i * 1e-3] for i in range(100)]
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(rows, indent=indent))
+    assert list(stream_list(path)) == rows
+    path.write_text("[]")
+    assert list(stream_list(path)) == []
+    path.write_text("[1, 2], 3")
+    with pytest.raises(ValueError, match=r"a\.json.*follows the end"):
+        list(stream_list(path))
+
+
+def test_elements_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(json_stream, "_CHUNK", 16)
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps([[1] * 10, [2] * 1000]))
+    elements = stream_list(path, max_value=100)
+    assert next(elements) == [1] * 10
+    with pytest.raises(ValueError, match="one value takes more than 100 characters"):
+        next(elements)
+    assert len(list(stream_list(path, max_value=4000))) == 2
+
+
+def test_numbers_that_are_not_finite_are_read_where_that_is_asked(tmp_path: Path):
+    path = tmp_path / "a.json"
+    path.write_text("[1, NaN, -Infinity]")
+    with pytest.raises(ValueError, match="NaN is no number"):
+        list(stream_list(path))
+    assert str(list(stream_list(path, allow_nan=True))) == "[1, nan, -inf]"
+
+
 def test_a_list_is_read_no_further_than_its_end(tmp_path: Path):
     path = tmp_path / "a.json"
     path.write_text('{"images": [1, 2], "annotations": [cut sho')

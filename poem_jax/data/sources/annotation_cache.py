@@ -7,20 +7,18 @@ time of what they were made from, so that a changed file gets a new one; nothing
 
 import functools
 import hashlib
-import json
 import logging
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from poem_jax.io.atomic import whole_file
+from poem_jax.io.json_stream import stream_list
 from poem_jax.io.user_cache import user_cache_folder
 from poem_jax.typing import Array, Float
 
-_CHUNK = 2**24
 _MAX_ROW = 2**21
 """Characters of one row: 778 vertices take 50,000."""
 
@@ -72,7 +70,7 @@ def _convert(path: Path, row_shape: tuple[int, ...], cached: Path) -> None:
     count = 0
     with whole_file(cached) as temporary, temporary.open("wb") as stream:
         _write_header(stream, (0, *row_shape))
-        for row in iterate_json_list(path):
+        for row in stream_list(path, max_value=_MAX_ROW, allow_nan=True):
             stream.write(_row(row, row_shape, path, count).tobytes())
             count += 1
         stream.seek(0)
@@ -92,43 +90,3 @@ def _row(row: object, shape: tuple[int, ...], path: Path, index: int) -> Array:
     if array.size != math.prod(shape):
         raise ValueError(f"{path}, row {index}: expected {shape} numbers; got shape {array.shape}")
     return array.reshape(shape)
-
-
-def iterate_json_list(path: Path) -> Iterator[object]:
-    """Yield the elements of a JSON file that is one list, with one element and one chunk in memory.
-
-    Raises:
-        ValueError: It is no list, is cut short, or has an element of over 2 million characters.
-    """
-    decoder = json.JSONDecoder()
-    with path.open(encoding="utf-8") as stream:
-        buffer, index, ended = stream.read(_CHUNK), 0, False
-        position = _skip_spaces(buffer, 0)
-        if buffer[position : position + 1] != "[":
-            raise ValueError(f"{path} must be a JSON list; it begins with {buffer[:20]!r}")
-        position += 1
-        while True:
-            position = _skip_spaces(buffer, position, also=",")
-            if buffer[position : position + 1] == "]":
-                return
-            if len(buffer) - position < _MAX_ROW and not ended:
-                read = stream.read(_CHUNK)
-                buffer, position, ended = buffer[position:] + read, 0, not read
-                position = _skip_spaces(buffer, position, also=",")
-                if buffer[position : position + 1] == "]":
-                    return
-            try:
-                element, position = decoder.raw_decode(buffer, position)
-            except (json.JSONDecodeError, RecursionError) as error:
-                raise ValueError(
-                    f"{path} cannot be read as a JSON list beyond element {index} ({error}). Is it cut "
-                    "short? Fetch it again"
-                ) from error
-            yield element
-            index += 1
-
-
-def _skip_spaces(text: str, position: int, *, also: str = "") -> int:
-    while text[position : position + 1] in set(" \t\r\n" + also):
-        position += 1
-    return position

@@ -3,15 +3,17 @@
 Layout (github.com/lmb-freiburg/freihand):
 
     FreiHAND_v2/{training,evaluation}/rgb/%08d.jpg, training_{K,xyz,verts,mano}.json
-    FreiHAND_v2_eval/evaluation_{K,xyz,verts,mano}.json     (the authors' FreiHAND_pub_v2_eval)
+    FreiHAND_v2_eval/evaluation_{K,xyz,verts,mano}.json     (the authors' FreiHAND_pub_v2_eval, which has
+                                                             evaluation/ as well and can do alone)
 
 Conventions of the set: metres in the camera's frame, which is the world; joints in OpenPose order; the 61
 numbers of `mano` are the wrist's rotation, 45 finger numbers relative to MANO's mean pose, 10 of the shape,
 and three of a translation in the image; pixels have their origin at a pixel's centre, so K gets + 0.5, and
 key points are projections.
 
-The 32,560 training images come with four backgrounds: image i has the labels i mod 32,560. Paper: 130,240
-training and 3,960 evaluation images.
+There are 32,560 unique training images, which the paper trains on, and 3,960 for the evaluation. The set has
+each training image before four backgrounds, 130,240 in all: image i has the labels i mod 32,560, and the
+first 32,560, taken before a green screen, come first.
 """
 
 from collections.abc import Mapping
@@ -38,7 +40,7 @@ SPLITS = ("train", "test", "evaluation")
 BACKGROUNDS = 4
 UNIQUE_IMAGES = 32_560
 """Training images in front of the green screen; their numbers start the next background's."""
-PAPER_COUNTS = {"training": BACKGROUNDS * UNIQUE_IMAGES, "evaluation": 3_960}
+EVALUATION_IMAGES = 3_960
 SIZE = 224
 ADVICE = (
     "Get FreiHAND_pub_v2.zip and FreiHAND_pub_v2_eval.zip from "
@@ -46,6 +48,7 @@ ADVICE = (
 )
 _ROW_SHAPES = {"K": (3, 3), "xyz": (NUM_JOINTS, 3), "verts": (NUM_VERTICES, 3), "mano": (61,)}
 _POSE_NUMBERS = 48
+_EVALUATION_FOLDERS = ("FreiHAND_v2_eval", "FreiHAND_pub_v2_eval")
 
 
 class FreiHAND:
@@ -56,23 +59,28 @@ class FreiHAND:
         root: str | Path,
         *,
         split: str = "train",
+        backgrounds: int = 1,
         mano: str | Path | None = None,
         strict_counts: bool = False,
     ) -> None:
         """Open the lists of labels. The first time their text is read (a minute), then they are cached.
 
         Args:
-            root: The folder `FreiHAND_v2`, or the one that holds it.
-            split: "train" (all backgrounds), or "test", also called "evaluation".
+            root: The folder `FreiHAND_v2`, or the one that holds it; for "test" `FreiHAND_v2_eval` will do.
+            split: "train", or "test", also called "evaluation".
+            backgrounds: How many of the four backgrounds a training image is taken with; 1 is the paper's.
             mano: The user's `MANO_RIGHT.pkl`: its mean pose is needed for poses. None: frames have no pose.
             strict_counts: Insist on the paper's number of images.
 
         Raises:
-            FileNotFoundError: No such folder or list.
-            ValueError: Another split, damaged lists, or lists of different lengths.
+            FileNotFoundError: No such folder or list, or a background without its first image.
+            ValueError: Another split or number of backgrounds, damaged lists, or lists of different lengths.
         """
         check_choice("split", split, SPLITS)
+        if not 1 <= backgrounds <= BACKGROUNDS:
+            raise ValueError(f"`backgrounds` must be 1 to {BACKGROUNDS}; got {backgrounds}")
         names = ("FreiHAND_v2", "FreiHAND_pub_v2", "FreiHAND")
+        names += () if split == "train" else _EVALUATION_FOLDERS
         folder = "training" if split == "train" else "evaluation"
         self.root = find_folder(root, names, f"{folder}/rgb", advice=ADVICE)
         self.name = f"freihand {split}"
@@ -89,8 +97,16 @@ class FreiHAND:
             raise ValueError(f"the lists {labels}/{folder}_*.json must be equally long; got {lengths}")
         self._unique = lengths["K"]
         self._stride = UNIQUE_IMAGES if self._image(UNIQUE_IMAGES).is_file() else self._unique
-        self._backgrounds = self._count_backgrounds() if split == "train" else 1
-        check_count(self.name, len(self), PAPER_COUNTS[folder], strict=strict_counts)
+        self._backgrounds = backgrounds if split == "train" else 1
+        for k in range(self._backgrounds):
+            need_file(self._image(k * self._stride), f"the first image of background {k + 1}", advice=ADVICE)
+        check_count(
+            self.name,
+            len(self),
+            self._backgrounds * UNIQUE_IMAGES if split == "train" else EVALUATION_IMAGES,
+            strict=strict_counts,
+            counted_by="the paper counts" if self._backgrounds == 1 else "the set's own count is",
+        )
 
     def __len__(self) -> int:
         return self._unique * self._backgrounds
@@ -134,13 +150,8 @@ class FreiHAND:
     def _image(self, number: int) -> Path:
         return self._images / f"{number:08d}.jpg"
 
-    def _count_backgrounds(self) -> int:
-        there = [self._image(k * self._stride).is_file() for k in range(BACKGROUNDS)]
-        return max(there.index(False) if False in there else BACKGROUNDS, 1)
-
 
 def _evaluation_labels(root: Path) -> Path:
     """Return the folder of the evaluation lists: the archive of its own, beside the set or in it."""
-    names = ("FreiHAND_v2_eval", "FreiHAND_pub_v2_eval")
-    places = [root, *(place / name for name in names for place in (root.parent, root))]
+    places = [root, *(place / name for name in _EVALUATION_FOLDERS for place in (root.parent, root))]
     return next((place for place in places if (place / "evaluation_xyz.json").is_file()), places[1])
