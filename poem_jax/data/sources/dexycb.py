@@ -11,7 +11,11 @@ have their origin at the centre of the first pixel (RealSense's), so K and key p
 
 A multi-view frame is an instant of a sequence in all views that show the hand (no `joint_2d` is -1). The
 camera 840412060917 is first; instants that it does not show are left out and counted. Paper: 25,387 / 1,412
-/ 4,951 frames for s0's train / val / test; the released tars hold 4,950 of the last.
+/ 4,951 frames for s0's train / val / test, before any are left out; the released tars hold 4,950 of the last.
+
+Left hands were labelled with the MANO_LEFT.pkl that was published, whose shape directions are faulty
+(`hand/mano_file.py`). Where only they give a sequence's labelled joints, its frames have no `shape`: its
+coefficients are not those of the mended hand, nor of the right one.
 """
 
 import logging
@@ -79,9 +83,10 @@ class DexYCB:
             split: "train", "val" or "test".
             setup: "s0" (all seen; the paper's), "s1" (unseen subjects) or "s3" (unseen objects).
             mano: The user's `MANO_RIGHT.pkl`.
-            left: Also take sequences of left hands, as the right hands that a mirror shows.
+            left: Also take sequences of left hands, as the right hands that a mirror shows; those whose
+                labels need the published file's faulty shape directions have `shape` None.
             mano_left: The user's `MANO_LEFT.pkl`, needed for those.
-            strict_counts: Insist on the paper's number of frames.
+            strict_counts: Insist on the paper's number of frames, and on 100 sequences of each subject.
 
         Raises:
             FileNotFoundError: No such folder, or it lacks a calibration or the split; no MANO file.
@@ -97,14 +102,14 @@ class DexYCB:
             if mano_left is None:
                 raise ValueError("left hands need `mano_left`, the path of MANO_LEFT.pkl; got None")
             self._mano["left"] = ManoFile.open(mano_left, side="left")
-        sequences = read_sequences(self.root, setup, split)
+        sequences = read_sequences(self.root, setup, split, strict=strict_counts)
         self._sequences = [sequence for sequence in sequences if sequence.side in self._mano]
         self._K = span_intrinsics(read_intrinsics(self.root))
         ids = {sequence.extrinsics for sequence in self._sequences}
         self._T_master_from_cam = {name: read_extrinsics(self.root, name) for name in sorted(ids)}
-        self._index = self._list_frames()
+        self._index, dropped = self._list_frames()
         paper = None if left else PAPER_COUNTS.get((setup, split))
-        check_count(self.name, len(self), paper, strict=strict_counts)
+        check_count(self.name, len(self) + dropped, paper, strict=strict_counts)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -119,13 +124,15 @@ class DexYCB:
         views = [_MASTER_VIEW, *(v for v in range(len(SERIALS)) if shown[v] and v != _MASTER_VIEW)]
         key = f"{sequence.name}/{frame:06d}"
         mano, folder = self._mano[sequence.side], self.root / sequence.name
-        labels = [_read_label(folder / SERIALS[v] / f"labels_{frame:06d}.npz", key) for v in views]
+        paths = [folder / SERIALS[v] / f"labels_{frame:06d}.npz" for v in views]
+        labels = [_read_label(path, key) for path in paths]
         pose_m = np.concatenate([label["pose_m"] for label in labels])
         joints = np.concatenate([label["joint_3d"] for label in labels])
         pose = mano.components.pose(pose_m[:, :3], pose_m[:, 3:48])
         shape = np.tile(sequence.betas, (len(views), 1))
-        mesh = self._mesh(sequence.side, pose, shape, pose_m[:, 48:], joints)
-        check_mesh(mesh.joints, joints, folder, key)
+        mesh, is_shape_ours = self._mesh(sequence.side, pose, shape, pose_m[:, 48:], joints)
+        for v, path in enumerate(paths):
+            check_mesh(mesh.joints[v : v + 1], joints[v : v + 1], path, key)
         T = invert_rigid(self._T_master_from_cam[sequence.extrinsics][views])
         made = MultiViewFrame(
             key=key,
@@ -138,7 +145,7 @@ class DexYCB:
             vertices_cam=mesh.vertices,
             keypoints_px=span_pixels(np.concatenate([label["joint_2d"] for label in labels])),
             pose_cam=pose.astype(np.float32),
-            shape=shape,
+            shape=shape if is_shape_ours else None,
         )
         made = check_frame(made, folder)
         return made if sequence.side == "right" else as_right_hand(made)
@@ -148,8 +155,9 @@ class DexYCB:
         keys = (f"{self._sequences[row[0]].name} {row[1:].tolist()}" for row in self._index)
         return {f"{self.root}, {self.name}": identify_list(keys)}
 
-    def _list_frames(self) -> Array:
-        """Return rows of sequence, frame, and for each camera whether it shows the hand (0 or 1).
+    def _list_frames(self) -> tuple[Array, int]:
+        """Return rows of sequence, frame, and for each camera whether it shows the hand (0 or 1); and how
+        many more the master does not show.
 
         Frames come in the order in which the release's reader first sees them: those of the first camera that
         shows them before those of the next.
@@ -165,7 +173,7 @@ class DexYCB:
             )
         if dropped:
             _log.warning("%s: %d frames are left out, as camera %s shows no hand", self.name, dropped, MASTER)
-        return np.concatenate(rows)
+        return np.concatenate(rows), dropped
 
     def _mesh(
         self,
@@ -174,8 +182,8 @@ class DexYCB:
         shape: Float[Array, "view 10"],
         translation: Float[Array, "view 3"],
         joints: Float[Array, "view 21 3"],
-    ) -> HandMesh:
-        """Run MANO.
+    ) -> tuple[HandMesh, bool]:
+        """Run MANO; tell, too, whether the hand is that of the file as we read it.
 
         The shape directions of the published left hand were faulty when the set was labelled, and
         `mano_file.load` mends them: of both readings the one that gives the labelled joints is taken.
@@ -183,10 +191,11 @@ class DexYCB:
         mano = self._mano[side]
         mesh = mano.mesh(pose, shape, translation)
         if side == "right":
-            return mesh
+            return mesh, True
         as_published = mano.hand._replace(shapedirs=mano.hand.shapedirs * _SHAPE_SIGN)
         other = mano.mesh(pose, shape, translation, hand=as_published)
-        return min(mesh, other, key=lambda made: float(np.abs(made.joints - joints).max()))
+        apart, apart_other = (float(np.abs(made.joints - joints).max()) for made in (mesh, other))
+        return (other, False) if apart_other < apart else (mesh, True)
 
 
 def _first_seen_order(shown: Bool[Array, "camera frame"]) -> Array:

@@ -58,12 +58,19 @@ def is_in_split(setup: str, split: str, subject: int, sequence: int) -> bool:
     return {3: "val", 19: "val", 7: "test", 11: "test", 15: "test"}.get(sequence // 5, "train") == split
 
 
-def read_sequences(root: Path, setup: str, split: str) -> list[Sequence]:
+def read_sequences(root: Path, setup: str, split: str, *, strict: bool = False) -> list[Sequence]:
     """Return the sequences of a split, in order of subject and time.
+
+    Args:
+        root: The set's folder.
+        setup: Of the splits.
+        split: Of the setup.
+        strict: Insist on 100 sequences of each subject; else a warning is logged.
 
     Raises:
         FileNotFoundError: There is none, or a calibration that one names is missing.
-        ValueError: A damaged `meta.yml` or `mano.yml`.
+        ValueError: A damaged `meta.yml` or `mano.yml`; `strict`, and a subject has another number of
+            sequences.
     """
     folders = sorted(f for f in root.iterdir() if f.is_dir() and _SUBJECT.fullmatch(f.name))
     sequences, without_meta = [], []
@@ -71,10 +78,13 @@ def read_sequences(root: Path, setup: str, split: str) -> list[Sequence]:
         subject = _subject_number(folder.name, place, len(folders), root)
         names = sorted(f.name for f in folder.iterdir() if f.is_dir())
         if len(names) != SEQUENCES_PER_SUBJECT:
-            _log.warning(
-                "%s has %d sequences of %d: splits go by a sequence's place, so this split is another",
-                *(folder, len(names), SEQUENCES_PER_SUBJECT),
+            message = (
+                f"{folder} has {len(names)} sequences of {SEQUENCES_PER_SUBJECT}: splits go by a sequence's "
+                "place, so this split is another"
             )
+            if strict:
+                raise ValueError(f"{message}. {ADVICE}")
+            _log.warning("%s", message)
         for number, name in enumerate(names):
             if not is_in_split(setup, split, subject, number):
                 continue
@@ -164,7 +174,8 @@ def read_intrinsics(root: Path) -> Float[Array, "camera 3 3"]:
 def views_with_hand(root: Path, sequence: Sequence) -> Bool[Array, "camera frame"]:
     """Tell in which images of a sequence the hand is labelled (no `joint_2d` is -1).
 
-    Labels that are missing or damaged count as present: the frame is then named when it is read.
+    Labels that are missing or damaged count as present: the frame is then named when it is read. What is
+    found is kept in the user's cache, unless a label was such a one: it may be there the next time.
     """
     folder = root / sequence.name
     times = [(folder / s).stat().st_mtime_ns if (folder / s).is_dir() else 0 for s in SERIALS]
@@ -174,20 +185,27 @@ def views_with_hand(root: Path, sequence: Sequence) -> Bool[Array, "camera frame
         return read_npz(cached, required=["shown"])["shown"]
     _log.info("reading the key points of %s once", folder)
     shown = np.ones((len(SERIALS), sequence.num_frames), bool)
+    unread = 0
     for camera, serial in enumerate(SERIALS):
         for frame in range(sequence.num_frames):
-            shown[camera, frame] = not _is_absent(folder / serial / f"labels_{frame:06d}.npz")
+            is_shown = _shows_hand(folder / serial / f"labels_{frame:06d}.npz")
+            shown[camera, frame] = is_shown is not False
+            unread += is_shown is None
+    if unread:
+        _log.warning("%s: %d labels cannot be read; the list of its views is not kept", folder, unread)
+        return shown
     with whole_file(cached) as temporary:
         np.savez(temporary, shown=shown)
     return shown
 
 
-def _is_absent(path: Path) -> bool:
+def _shows_hand(path: Path) -> bool | None:
+    """Tell whether a label has the hand's key points; None where it cannot be read."""
     try:
         joint_2d = read_label_arrays(path, {"joint_2d": LABEL_SHAPES["joint_2d"]})["joint_2d"]
     except ValueError:
-        return False
-    return bool((joint_2d == -1).any())
+        return None
+    return not (joint_2d == -1).any()
 
 
 def _mapping(value: Any, path: Path) -> dict:

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from poem_jax.data.frames import CorruptSampleError
+from poem_jax.data.sources import dexycb_files
 from poem_jax.data.sources.dexycb import MASTER, DexYCB
 from poem_jax.data.sources.dexycb_files import is_in_split
+from poem_jax.geometry.cameras import project_cam
 from poem_jax.geometry.transforms import rotation_from_axis_angle
-from poem_jax.miniatures.mano_stand_in import write_mano
+from poem_jax.hand.model import hand_mesh
+from poem_jax.miniatures.mano_stand_in import stand_in_components, stand_in_hand, write_mano
 from tests.data.sources.raw_trees import SERIALS, write_dexycb
 
 MASTER_FIRST = [2, 0, 1, 3, 4, 5, 6, 7]
@@ -73,6 +76,20 @@ def test_the_list_is_read_from_the_labels_once(tmp_path, mano):
         second[0]
 
 
+def test_a_list_of_labels_that_could_not_be_read_is_not_kept(tmp_path, mano, caplog):
+    write_dexycb(tmp_path, sequences=1, frames=2, absent={(4, 1)})
+    path = next(tmp_path.rglob(f"{SERIALS[4]}/labels_000001.npz"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:100])
+    with caplog.at_level(logging.WARNING):
+        damaged = DexYCB(tmp_path, mano=mano)
+    assert any("1 labels cannot be read" in message for message in caplog.messages)
+    with pytest.raises(CorruptSampleError, match=rf"{SERIALS[4]}/labels_000001\.npz"):
+        damaged[1]
+    path.write_bytes(whole)
+    assert SERIALS[4] not in DexYCB(tmp_path, mano=mano)[1].view_names
+
+
 @pytest.mark.parametrize(
     ("setup", "counts"),
     [("s0", (800, 40, 160)), ("s1", (700, 100, 200)), ("s3", (750, 100, 150))],
@@ -91,6 +108,29 @@ def test_left_hands_are_dropped_or_mirrored(tmp_path, mano):
         DexYCB(tmp_path, mano=mano, left=True)
     with pytest.raises(ValueError, match="must be a left hand"):
         DexYCB(tmp_path, mano=mano, left=True, mano_left=mano)
+
+
+@pytest.mark.parametrize("faulty", [False, True])
+def test_a_left_hand_has_a_shape_unless_its_labels_need_the_faulty_directions(tmp_path, mano, faulty):
+    write_dexycb(tmp_path, sequences=1, side="left")
+    left = write_mano(tmp_path / "MANO_LEFT.pkl", side="left")
+    hand = stand_in_hand("left")
+    if faulty:
+        hand = hand._replace(shapedirs=hand.shapedirs * np.array([-1, 1, 1], np.float32)[:, None])
+    source = DexYCB(tmp_path, mano=mano, left=True, mano_left=left)
+    betas = source._sequences[0].betas
+    for path in tmp_path.rglob("labels_*.npz"):
+        arrays = dict(np.load(path))
+        pose_m = arrays["pose_m"]
+        pose = stand_in_components("left").pose(pose_m[:, :3], pose_m[:, 3:48])
+        joints = hand_mesh(hand, pose[0], betas, pose_m[0, 48:]).joints
+        K = source._K[SERIALS.index(path.parent.name)]
+        changed = {"joint_3d": joints[None], "joint_2d": project_cam(K, joints)[None] - 0.5}
+        np.savez(path, **{**arrays, **{name: value.astype(np.float32) for name, value in changed.items()}})
+    frame = source[0]
+    assert frame.mirror_px is not None
+    assert frame.pose_cam is not None
+    assert (frame.shape is None) == faulty
 
 
 @pytest.mark.parametrize(("setup", "split"), [("s2", "train"), ("s0", "evaluation")])
@@ -112,9 +152,13 @@ def test_what_is_missing_is_named_with_where_to_get_it(tmp_path, mano):
         DexYCB(tmp_path, mano=mano)
 
 
-def test_counts_of_the_paper_are_compared(tmp_path, mano):
-    write_dexycb(tmp_path, sequences=1)
-    with pytest.raises(ValueError, match="has 1 frames, and the paper counts 25387"):
+def test_counts_of_the_paper_are_compared(tmp_path, mano, monkeypatch):
+    write_dexycb(tmp_path, sequences=1, frames=2, absent={(2, 1)})
+    with pytest.raises(ValueError, match=r"subject-01 has 1 sequences of 100.*dex-ycb\.github\.io"):
+        DexYCB(tmp_path, mano=mano, strict_counts=True)
+    monkeypatch.setattr(dexycb_files, "SEQUENCES_PER_SUBJECT", 1)
+    # Frames that the master does not show are in the paper's number.
+    with pytest.raises(ValueError, match="has 2 frames, and the paper counts 25387"):
         DexYCB(tmp_path, mano=mano, strict_counts=True)
 
 
@@ -124,5 +168,5 @@ def test_labels_of_another_hand_are_refused(tmp_path, mano):
     path = next(tmp_path.rglob(f"{MASTER}/labels_000000.npz"))
     arrays = dict(np.load(path))
     np.savez(path, **{**arrays, "pose_m": arrays["pose_m"] + np.eye(51)[50] * 0.1})
-    with pytest.raises(CorruptSampleError, match=r"0\.1 m from the labelled"):
+    with pytest.raises(CorruptSampleError, match=rf"{MASTER}/labels_000000\.npz.*0\.1 m from the labelled"):
         source[0]
