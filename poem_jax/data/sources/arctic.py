@@ -30,6 +30,7 @@ from poem_jax.data.sources.raw_sets import (
     identify,
     identify_list,
     need_file,
+    numbers,
     read_image,
 )
 from poem_jax.geometry.cameras import project_cam
@@ -226,12 +227,10 @@ def _read_rigs(path: Path, subjects: set[str]) -> dict[str, _Rig]:
         held = misc.get(subject) if isinstance(misc, dict) else None
         if not isinstance(held, dict):
             raise ValueError(f"{path} must describe the cameras of subject {subject}; it does not")
-        parts = []
-        for name, shape in (("intris_mat", (8, 3, 3)), ("world2cam", (8, 4, 4)), ("image_size", (9, 2))):
-            array = np.asarray(held.get(name, []), dtype=np.float64)
-            if array.shape != shape:
-                raise ValueError(f"{path}: `{name}` of {subject} must have shape {shape}; got {array.shape}")
-            parts.append(array)
+        parts = [
+            numbers(held.get(name, []), shape, f"{path}: `{name}` of {subject}")
+            for name, shape in (("intris_mat", (8, 3, 3)), ("world2cam", (8, 4, 4)), ("image_size", (9, 2)))
+        ]
         offset = held.get("ioi_offset")
         if type(offset) is not int:
             raise ValueError(f"{path}: `ioi_offset` of {subject} must be a whole number; got {offset!r}")
@@ -259,11 +258,11 @@ def _read_hand(path: Path, hand: str, key: str) -> _Hand:
 def _parse_hand(path: Path, hand: str, mtime_ns: int) -> _Hand:
     held = load_npy_dict(path).get(hand)
     arrays = {}
-    for name, numbers in _HAND_NUMBERS.items():
+    for name, width in _HAND_NUMBERS.items():
         value = held.get(name) if isinstance(held, dict) else None
         array = np.asarray([] if value is None else value)
-        if array.dtype.kind not in "fiu" or array.ndim > 2 or array.size == 0 or array.shape[-1] != numbers:
-            raise ValueError(f"`{hand}` must have `{name}` with rows of {numbers} numbers; got {array.shape}")
+        if array.dtype.kind not in "fiu" or array.ndim > 2 or array.size == 0 or array.shape[-1] != width:
+            raise ValueError(f"`{hand}` must have `{name}` with rows of {width} numbers; got {array.shape}")
         arrays[name] = np.atleast_2d(array).astype(np.float32)
     rows = {len(arrays[name]) for name in ("rot", "pose", "trans")}
     if len(rows) > 1 or len(arrays["shape"]) not in (1, *rows):

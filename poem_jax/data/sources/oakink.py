@@ -11,6 +11,8 @@ Conventions: `hand_j` (OpenPose order) and `hand_v` are metres in each camera's 
 to camera; the pose is 16 quaternions wxyz in the world, zero = flat hand (manotorch's layer with its default,
 `flat_hand_mean` True); pixels count from the centre of the first, so K gets half a pixel here. Key points are
 the projected joints. A hand-over shows two people's right hands, told apart by sid: each is a sample.
+
+Paper: 58,692 frames for SP2's train+val and 19,909 for its test; the released tars hold 21,351 of the test.
 """
 
 from pathlib import Path
@@ -205,7 +207,7 @@ def _is_entry(entry: Any) -> bool:
 def _load(path: Path, key: str) -> Any:
     try:
         return load_tensors_pickle(path)
-    except (FileNotFoundError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise CorruptSampleError(path, key, str(error)) from error
 
 
@@ -217,7 +219,10 @@ def _field(held: Any, name: str, shape: tuple[int, ...], path: Path, key: str) -
 
 def _checked(value: Any, name: str, shape: tuple[int, ...], path: Path, key: str) -> Float[Array, "..."]:
     """Return numbers of a shape; flat ones are arranged (poses are kept flat in some files)."""
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise CorruptSampleError(path, key, f"`{name}` must be numbers of shape {shape}; {error}") from error
     if array.dtype.kind not in "fiu" or array.size != np.prod(shape):
         raise CorruptSampleError(
             path, key, f"`{name}` must be numbers of shape {shape}; got {array.shape} of {array.dtype}"

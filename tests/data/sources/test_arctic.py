@@ -124,10 +124,16 @@ def test_bad_labels_are_named(data: Path, mano: Path):
     assert source.fingerprint()
     misc = data / "meta" / "misc.json"
     cameras = json.loads(misc.read_text())
-    cameras["s05"]["world2cam"] = cameras["s05"]["world2cam"][:7]
-    misc.write_text(json.dumps(cameras))
-    with pytest.raises(ValueError, match=r"misc\.json: `world2cam` of s05 must have shape \(8, 4, 4\)"):
-        Arctic(data, split="val", mano=mano)
+    whole = cameras["s05"]["world2cam"]
+    for value, problem in (
+        (whole[:7], r"must have shape \(8, 4, 4\)"),
+        ([*whole[:7], [[1]]], "must be numbers"),
+        ([*whole[:7], [["a"] * 4] * 4], "must be numbers"),
+    ):
+        cameras["s05"]["world2cam"] = value
+        misc.write_text(json.dumps(cameras))
+        with pytest.raises(ValueError, match=rf"misc\.json: `world2cam` of s05 {problem}"):
+            Arctic(data, split="val", mano=mano)
 
 
 def test_a_source_can_be_pickled(written: tuple[Path, list[PlantedFrame]], mano: Path):

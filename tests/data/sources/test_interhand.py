@@ -104,6 +104,17 @@ def test_changed_annotations_are_read_anew(root: Path, mano: Path):
     np.testing.assert_allclose(moved, 7e-3, atol=1e-6)
 
 
+def test_a_fit_of_another_hand_is_refused(root: Path, mano: Path):
+    def turn(content: dict) -> None:
+        for frames in content.values():
+            for fits in frames.values():
+                fits["right"]["pose"][:3] = [-x for x in fits["right"]["pose"][:3]]
+
+    _edit(root, "val", "MANO_NeuralAnnot", turn)
+    with pytest.raises(CorruptSampleError, match=r"MANO_NeuralAnnot\.json, sample Capture.*at most 0\.05"):
+        InterHand(root, split="val", mano=mano)[0]
+
+
 def test_joints_are_gathered_as_the_set_lists_them():
     expected = [20, 3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12, 19, 18, 17, 16]
     assert list(OPENPOSE_FROM_INTERHAND) == expected
@@ -114,6 +125,23 @@ def test_what_is_missing_or_wrong_is_named(root: Path, mano: Path, tmp_path: Pat
         InterHand(tmp_path / "nowhere", mano=mano)
     with pytest.raises(ValueError, match="`views` and `draws` must be positive"):
         InterHand(root, mano=mano, views=0)
+
+    def replace_a_focal_length(value: object) -> None:
+        def change(content: dict) -> None:
+            for rig in content.values():
+                rig["focal"][next(iter(rig["focal"]))] = value
+
+        _edit(root, "val", "camera", change)
+
+    for value, problem in (
+        (["wide", 1], "must be numbers"),
+        ([[1], 2], "must be numbers"),
+        ([1], r"must have shape \(2,\)"),
+    ):
+        replace_a_focal_length(value)
+        with pytest.raises(ValueError, match=rf"val_camera\.json, capture .*`focal` of camera .*{problem}"):
+            InterHand(root, split="val", mano=mano)
+    replace_a_focal_length([1200, 1200])
     _edit(root, "val", "camera", lambda content: [rig["campos"].clear() for rig in content.values()])
     with pytest.raises(CorruptSampleError, match=r"val_camera\.json, sample Capture.*must have cameras"):
         InterHand(root, split="val", mano=mano)[0]

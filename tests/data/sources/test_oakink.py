@@ -116,9 +116,16 @@ def test_bad_samples_are_named(as_it_comes: Path):
         CorruptSampleError, match=r"`hand_j` must be numbers of shape \(21, 3\); got \(20, 3\)"
     ):
         source[0]
+    joints.write_bytes(pickle.dumps([[1.0, 2.0], [3.0]]))
+    with pytest.raises(CorruptSampleError, match=rf"sample {key}: `hand_j` must be numbers .*inhomogeneous"):
+        source[0]
     joints.write_bytes(b"cposix\nsystem\n(S'true'\ntR.")
     with pytest.raises(CorruptSampleError, match=r"hand_j.*asks for posix\.system"):
         source[0]
     joints.unlink()
     with pytest.raises(CorruptSampleError, match=r"no file at .*hand_j"):
+        source[0]
+    # Every system call on a name this long fails.
+    joints.symlink_to("x" * 256)
+    with pytest.raises(CorruptSampleError, match=rf"sample {key}.*hand_j"):
         source[0]
