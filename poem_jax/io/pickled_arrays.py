@@ -151,6 +151,21 @@ class PickledArray:
         return flat.reshape(self._shape, order=self._order).copy(order="K")  # type: ignore[call-overload]
 
 
+class PickledArrayOrDict(PickledArray):
+    """An array of numbers or, without axes, of one dict, which `array` gives as [dict]."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        """Take what `PickledArray` takes, or (1, (), objects, Fortran order, [dict])."""
+        whole = isinstance(state, tuple) and len(state) == 5 and isinstance(state[2], ObjectDtype)
+        if not whole or state[1] != () or not _is_one_dict(state[4]):
+            super().__setstate__(state)
+            return
+        self._refuse_second_contents()
+        self._rows = state[4]
+
+
 class TensorStorage:
     """A row of `numel` numbers, from number `start` of the run that the file keeps under `key`."""
 
@@ -235,6 +250,10 @@ class PickledTensor:
         strides = tuple(stride * numbers.itemsize for stride in self._strides)
         first = self.storage.start + self._offset
         return as_strided(numbers[first:], self.shape, strides).copy(order="C")
+
+
+def _is_one_dict(rows: Any) -> bool:
+    return isinstance(rows, list) and len(rows) == 1 and isinstance(rows[0], dict)
 
 
 def _is_plain_state(state: tuple) -> bool:

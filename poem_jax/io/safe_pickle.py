@@ -9,13 +9,21 @@ stand-ins that merely keep their state. Any other global is refused by name befo
 
 import codecs
 import contextlib
+import functools
 import io
 import pickle
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from poem_jax.io.pickled_arrays import ObjectDtype, PickledArray, PickledDtype, describe_dtype, refuse_change
+from poem_jax.io.pickled_arrays import (
+    ObjectDtype,
+    PickledArray,
+    PickledArrayOrDict,
+    PickledDtype,
+    describe_dtype,
+    refuse_change,
+)
 
 _NUMPY_CORE = ("numpy.core", "numpy._core")
 _BUILTINS = ("builtins", "__builtin__")
@@ -75,6 +83,8 @@ class Vocabulary(NamedTuple):
     """True for the (module, name) of a class that may be replaced by a `StandIn`."""
     persistent: Callable[[Any], Any] | None = None
     """Describes an object outside the pickle by its id, whatever that is; None refuses them all."""
+    array_of_dict: bool = False
+    """True: an array without axes may hold one dict, as `np.save(path, {...})` writes it."""
     advice: str = "Do not trust this file."
     """Ends the message about a global that is refused."""
 
@@ -104,10 +114,20 @@ def loads_arrays_pickle(
     data: bytes,
     stand_ins: Callable[[str, str], bool] = lambda module, name: False,
     source: str = "the pickle",
+    *,
+    array_of_dict: bool = False,
 ) -> Any:
-    """Read a pickle from memory; see `load_arrays_pickle`. `source` names it in messages."""
+    """Read a pickle from memory; see `load_arrays_pickle`.
+
+    Args:
+        data: the pickle.
+        stand_ins: as there.
+        source: names the pickle in messages.
+        array_of_dict: an array without axes may hold one dict, and is given as the list [dict].
+    """
+    vocabulary = Vocabulary(stand_ins=stand_ins, array_of_dict=array_of_dict)
     with _problems_named(source):
-        described = _Reader(io.BytesIO(data), Vocabulary(stand_ins=stand_ins), source).load()
+        described = _Reader(io.BytesIO(data), vocabulary, source).load()
         return _Finisher().finish(described)
 
 
@@ -162,7 +182,8 @@ class _Reader(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
-            return _ALLOWED[module, name]
+            allowed = _ALLOWED[module, name]
+            return _ARRAY_OR_DICT if self._vocabulary.array_of_dict and allowed is _ARRAY else allowed
         if (module, name) in self._vocabulary.names:
             return self._vocabulary.names[module, name]
         if self._vocabulary.stand_ins(module, name):
@@ -303,7 +324,9 @@ _NDARRAY = Inert("numpy.ndarray")
 _OBJECT = Inert("object")
 
 
-def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> PickledArray:
+def _reconstruct(
+    subtype: Any, shape: Any, dtype: Any, *, announced: type[PickledArray] = PickledArray
+) -> PickledArray:
     """Announce an array that the pickle then fills; only true `ndarray`s."""
     if subtype is not _NDARRAY:
         raise ValueError("only plain numpy.ndarray can be rebuilt")
@@ -311,7 +334,11 @@ def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> PickledArray:
         raise ValueError(
             "an array must start empty and of bytes, as NumPy writes it: no arrays of Python objects"
         )
-    return PickledArray()
+    return announced()
+
+
+_ARRAY = Inert("_reconstruct", _reconstruct)
+_ARRAY_OR_DICT = Inert("_reconstruct", functools.partial(_reconstruct, announced=PickledArrayOrDict))
 
 
 def _scalar(dtype: Any, data: Any = None) -> PickledArray:
@@ -382,7 +409,7 @@ _ALLOWED: dict[tuple[str, str], Any] = {
     ("_codecs", "encode"): Inert("_codecs.encode", _encode),
     ("collections", "OrderedDict"): Inert("collections.OrderedDict", _make_dict),
     ("collections", "Counter"): Inert("collections.Counter", _make_dict),
-    **{(f"{core}.multiarray", "_reconstruct"): Inert("_reconstruct", _reconstruct) for core in _NUMPY_CORE},
+    **{(f"{core}.multiarray", "_reconstruct"): _ARRAY for core in _NUMPY_CORE},
     **{(f"{core}.multiarray", "scalar"): Inert("scalar", _scalar) for core in _NUMPY_CORE},
     **{(f"{core}.numeric", "_frombuffer"): Inert("_frombuffer", _from_buffer) for core in _NUMPY_CORE},
     **{(name, "_reconstructor"): Inert("_reconstructor", _new_stand_in) for name in ("copyreg", "copy_reg")},

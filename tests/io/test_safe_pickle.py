@@ -157,3 +157,18 @@ def test_rows_of_lists_are_read_and_no_other_objects():
     for other in (np.array([{}], object), np.array([[None]], object), np.array([print], object)):
         with pytest.raises(ValueError, match=r"refused"):
             loads_arrays_pickle(pickle.dumps(other))
+
+
+def test_an_array_of_one_dict_is_read_where_that_is_asked():
+    one = np.empty((), object)
+    one[()] = {"rot": np.arange(3.0)}
+    two = np.array([{"a": 1}, {"b": 2}], dtype=object)
+    text = np.empty((), object)
+    text[()] = "no dict"
+    held = loads_arrays_pickle(pickle.dumps(one), array_of_dict=True)
+    np.testing.assert_array_equal(held[0]["rot"], np.arange(3.0))
+    with pytest.raises(ValueError, match="only rows of lists are read"):
+        loads_arrays_pickle(pickle.dumps(one))
+    for other in (two, text):
+        with pytest.raises(ValueError, match="only rows of lists are read"):
+            loads_arrays_pickle(pickle.dumps(other), array_of_dict=True)
