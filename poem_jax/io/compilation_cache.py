@@ -1,8 +1,9 @@
 """Where compiled programs are kept between runs, so that only the first run on a machine waits for XLA."""
 
 import os
-import sys
 from pathlib import Path
+
+from poem_jax.io.user_cache import user_cache_folder
 
 _VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 
@@ -10,8 +11,8 @@ _VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 def use_compilation_cache() -> Path:
     """Turn on JAX's persistent cache; call it before the first compilation.
 
-    Returns: the folder: `JAX_COMPILATION_CACHE_DIR` where that is set, else `poem_jax/xla` in the user's
-    cache folder (`XDG_CACHE_HOME`, else `~/.cache`, on macOS `~/Library/Caches`).
+    Returns: the folder: `JAX_COMPILATION_CACHE_DIR` where that is set, else `xla` in our folder of the user's
+    cache (`user_cache.py`).
     """
     import jax
 
@@ -19,13 +20,6 @@ def use_compilation_cache() -> Path:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     if _VARIABLE in os.environ:
         return Path(os.environ[_VARIABLE])
-    folder = _user_cache() / "poem_jax" / "xla"
+    folder = user_cache_folder() / "xla"
     jax.config.update("jax_compilation_cache_dir", str(folder))
     return folder
-
-
-def _user_cache() -> Path:
-    # The XDG specification counts an empty variable as unset.
-    if given := os.environ.get("XDG_CACHE_HOME"):
-        return Path(given)
-    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
