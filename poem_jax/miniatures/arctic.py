@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from poem_jax.hand.topology import WRIST
+from poem_jax.hand.topology import NUM_SHAPES, WRIST
 from poem_jax.miniatures.enlarged import enlarged
 from poem_jax.miniatures.files import CUBE_OBJ, save, save_json, save_npy
 from poem_jax.miniatures.labels import joints_world, pose_world, with_smplx_tips
@@ -64,8 +64,14 @@ def write(root: Path, *, frames: int = 2, seed: int = 0) -> list[PlantedFrame]:
     rigs = {}
     for order, sequence in enumerate(_SEQUENCES):
         rig = large_rig((seed, 6, order))
+        shape = np.random.default_rng((seed, 7, order)).standard_normal(NUM_SHAPES)
         shown = [
-            plant_large((seed, 6, order, i), rig, f"{sequence.subject}/{sequence.name}/{_UNUSED + i:05d}")
+            plant_large(
+                (seed, 6, order, i),
+                rig,
+                f"{sequence.subject}/{sequence.name}/{_UNUSED + i:05d}",
+                shape=shape,
+            )
             for i in range(frames if sequence.split == "train" else 1)
         ]
         shown = [with_smplx_tips(frame) for frame in shown]
@@ -89,9 +95,16 @@ def large_rig(seed: tuple[int, ...]) -> Rig:
     return draw_rig(seed, VIEWS, [(w // _FACTOR, h // _FACTOR) for w, h in sizes])
 
 
-def plant_large(seed: tuple[int, ...], rig: Rig, key_hint: str, *, side: str = "right") -> PlantedFrame:
-    """Plant a hand in pictures of full size."""
-    return enlarged(plant(seed, rig, stand_in_hand(side), key_hint=key_hint), _FACTOR)
+def plant_large(
+    seed: tuple[int, ...],
+    rig: Rig,
+    key_hint: str,
+    *,
+    side: str = "right",
+    shape: Float[Array, "10"] | None = None,
+) -> PlantedFrame:
+    """Plant a hand in pictures of full size; `shape` None draws its shape."""
+    return enlarged(plant(seed, rig, stand_in_hand(side), key_hint=key_hint, shape=shape), _FACTOR)
 
 
 def _write_images(folder: Path, shown: list[PlantedFrame]) -> None:

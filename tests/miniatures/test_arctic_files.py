@@ -9,6 +9,7 @@ import pytest
 from poem_jax.geometry.cameras import project_cam
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.hand.model import hand_mesh
+from poem_jax.miniatures import arctic
 from poem_jax.miniatures.mano_stand_in import stand_in_components, stand_in_hand
 
 
@@ -65,3 +66,15 @@ def test_no_sequence_is_in_two_splits(written):
     every = [name for names in lists.values() for name in names]
     assert set(lists) == {"train", "val", "test"}
     assert len(set(every)) == len(every) == 3
+
+
+def test_all_frames_of_a_sequence_have_the_one_shape_of_its_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(arctic, "_write_images", lambda folder, shown: None)
+    monkeypatch.setattr(arctic, "_black", lambda: b"")
+    planted = arctic.write(tmp_path, frames=2)
+    assert len(planted) == 3
+    for frame in planted:
+        subject, sequence, _ = frame.key_hint.split("/")
+        path = tmp_path / "arctic_data" / "data" / "raw_seqs" / subject / f"{sequence}.mano.npy"
+        held = np.load(path, allow_pickle=True).item()
+        np.testing.assert_array_equal(held["right"]["shape"], frame.shape)
