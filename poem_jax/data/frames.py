@@ -150,6 +150,10 @@ def _problems(frame: MultiViewFrame) -> Iterator[str]:
     bad |= (np.abs(last - [0, 0, 0, 1]) > 1e-6).any(-1)
     if bad.any():
         yield f"the extrinsic is not rigid (R R^T = 1, det R = 1, last row 0 0 0 1) in {_views(frame, bad)}"
+    if frame.box_px is not None:
+        bad = (frame.box_px[:, :2] >= frame.box_px[:, 2:]).any(-1)
+        if bad.any():
+            yield f"`box_px` is not x0 y0 x1 y1 with x0 < x1 and y0 < y1 in {_views(frame, bad)}"
     for name in ("joints_cam", "vertices_cam"):
         points = getattr(frame, name)
         extent = np.linalg.norm(points - points.mean(1, keepdims=True), axis=-1).max(-1)

@@ -134,12 +134,14 @@ class FreiHANDSource:
     mano: str | None = None
     """MANO_RIGHT.pkl, for the mean pose; the set stores its vertices."""
     split: str = "train"
+    backgrounds: int = 1
+    """Of each training image: 1 = the paper's 32,560 images, 4 = all 130,240."""
 
     def open(self) -> FrameSource:
         """List the frames of the split."""
         from poem_jax.data.sources.freihand import FreiHAND
 
-        return FreiHAND(self.root, split=self.split, mano=self.mano)
+        return FreiHAND(self.root, split=self.split, backgrounds=self.backgrounds, mano=self.mano)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ PATH = "shards/DexYCB_mv_train-000000.tar"
 
 @pytest.fixture(scope="module")
 def frame():
-    return one_frame()
+    frame = one_frame()
+    return frame._replace(box_px=np.concatenate([frame.keypoints_px.min(1), frame.keypoints_px.max(1)], -1))
 
 
 def changed(frame, name, view, change):
@@ -53,6 +54,9 @@ FAULTS = {
     "a transposed extrinsic": ("T_cam_from_world", lambda T: T.T, "is not rigid"),
     "a negative focal length": ("K", lambda K: K * [[-1], [1], [1]], "K is not"),
     "a transposed K": ("K", lambda K: K.T, "K is not"),
+    "a box from right to left": ("box_px", lambda box: box[[2, 1, 0, 3]], "`box_px` is not x0 y0 x1 y1"),
+    "a box from below": ("box_px", lambda box: box[[0, 3, 2, 1]], "`box_px` is not x0 y0 x1 y1"),
+    "an empty box": ("box_px", lambda box: box[[0, 1, 0, 3]], "`box_px` is not x0 y0 x1 y1"),
 }
 
 
