@@ -25,6 +25,8 @@ from poem_jax.typing import Array, Float
 
 _SPAN_FROM_INDEX = np.array([[1, 0, HALF_PIXEL], [0, 1, HALF_PIXEL], [0, 0, 1]])
 _INDEX_FROM_SPAN = np.array([[1, 0, -HALF_PIXEL], [0, 1, -HALF_PIXEL], [0, 0, 1]])
+_DECIMALS = 3
+"""Of a centre in pixels; what lies beyond is float32's rounding."""
 
 
 class Squares(NamedTuple):
@@ -64,7 +66,12 @@ def release_squares(points_px: Float[Array, "view point 2"], ratio: float) -> Sq
     """Return the squares of POEM's releases: the centre, counted from the centre of the top-left pixel, is
     truncated towards zero."""
     center, side = exact_squares(points_px, ratio)
-    return Squares(np.trunc(center - HALF_PIXEL) + HALF_PIXEL, side)
+    return Squares(whole_pixels(center - HALF_PIXEL) + HALF_PIXEL, side)
+
+
+def whole_pixels(center_px: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    """Truncate towards zero, so that a whole number which rounding left a trace below itself stays."""
+    return np.trunc(np.round(center_px, _DECIMALS))
 
 
 def exact_crops(

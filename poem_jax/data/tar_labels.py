@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from poem_jax.data.crops import whole_pixels
 from poem_jax.data.frames import EncodedImage, MultiViewFrame, check_frame
 from poem_jax.data.label_fields import LabelFields
 from poem_jax.data.sources.hand_in_views import ManoFile, span_intrinsics, span_pixels
@@ -193,11 +194,11 @@ def _own_boxes(read: LabelFields, keypoints_px: Float[Array, "view 21 2"]) -> Fl
         raise read.error(f"`bbox_scale` must be positive; got {scale.tolist()}")
     side = scale / BOX_RATIO
     low, high = keypoints_px.min(1), keypoints_px.max(1)
-    of_points = span_pixels(np.trunc((low + high) / 2 - 0.5))
+    of_points = span_pixels(whole_pixels((low + high) / 2 - 0.5))
     moved = np.abs(center + 0.5 - of_points).max(-1)
     if (moved <= _SAME_BOX_PX).all() and (np.abs(side - (high - low).max(-1)) <= _SAME_BOX_PX).all():
         return None
-    return box_from_center(span_pixels(center), side).astype(np.float32)
+    return box_from_center(span_pixels(center), side)
 
 
 def _boxes_to_store(frame: MultiViewFrame, keypoints_index: Array) -> tuple[Array, Array]:
@@ -206,7 +207,7 @@ def _boxes_to_store(frame: MultiViewFrame, keypoints_index: Array) -> tuple[Arra
         low, high = keypoints_index.min(1), keypoints_index.max(1)
     else:
         low, high = frame.box_px[:, :2] - 0.5, frame.box_px[:, 2:] - 0.5
-    return np.trunc((low + high) / 2), (high - low).max(-1)
+    return whole_pixels((low + high) / 2), (high - low).max(-1)
 
 
 def _with_pose(
