@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from poem_jax.data.frames import CorruptSampleError
-from poem_jax.data.tar_index import tar_index
+from poem_jax.data.tar_index import shown, tar_index
 
 _BRACES = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _MAX_SHARDS = 10**5
@@ -36,7 +36,7 @@ class ShardSet:
 
         Raises:
             FileNotFoundError: a file is missing; all missing ones are named.
-            ValueError: no file, a file twice, or no whole sample in any of them.
+            ValueError: no file, a file or a name twice, or no whole sample in any of them.
         """
         _check_list(paths)
         self.paths = tuple(Path(path) for path in paths)
@@ -69,6 +69,25 @@ class ShardSet:
     def __len__(self) -> int:
         return int(self._ends[-1])
 
+    @property
+    def lost_samples(self) -> int:
+        """About how many samples `faults` stand for.
+
+        A shard that ends early lacks what the other shards have more (their median), or what would fit into
+        its bytes behind the last whole sample, whichever is more; at least one. Any other fault is a sample.
+        """
+        ends_early = [index.ends_early for index in self._indices]
+        whole = [len(index) for index, early in zip(self._indices, ends_early, strict=True) if not early]
+        usual = int(np.median(whole)) if whole else 0
+        samples = sum(map(len, self._indices))
+        sample_bytes = sum(index.end for index in self._indices) / max(samples, 1)
+        lost = len(self.faults)
+        for path, index, early in zip(self.paths, self._indices, ends_early, strict=True):
+            if early:
+                behind = (path.stat().st_size - index.end) / sample_bytes if samples else 0.0
+                lost += max(usual - len(index), round(behind), 1) - 1
+        return lost
+
     def locate(self, index: int) -> tuple[Path, str]:
         """Return the shard and the key of a sample.
 
@@ -98,7 +117,7 @@ class ShardSet:
         for index, rows in zip(self._indices, self._rows, strict=True):
             if not len(rows):
                 continue
-            names = [re.fullmatch(pattern, name.decode()) is not None for name in index.suffixes]
+            names = [re.fullmatch(pattern, shown(name)) is not None for name in index.suffixes]
             counts = np.add.reduceat(np.array(names, np.int64)[index.suffix], index.first[:-1])
             most = max(most, int(counts[rows].max()))
         return most
@@ -159,7 +178,7 @@ def _expand_one(text: str) -> tuple[Path, ...]:
     text = os.path.expanduser(text)
     path = Path(text)
     if path.is_dir():
-        found = tuple(sorted(path.glob("*.tar")))
+        found = tuple(sorted(file for file in path.glob("*.tar") if not is_hidden(file)))
         if not found:
             raise FileNotFoundError(f"no tar file in the folder {path}; give the folder of the shards")
         return found
@@ -170,11 +189,16 @@ def _expand_one(text: str) -> tuple[Path, ...]:
         numbers = (str(number).zfill(len(low)) for number in range(int(low), int(high) + 1))
         return tuple(p for n in numbers for p in _expand_one(text[: match.start()] + n + text[match.end() :]))
     if not path.exists() and any(letter in text for letter in "*?["):
-        found = tuple(Path(name) for name in sorted(glob(text)))
+        found = tuple(file for file in map(Path, sorted(glob(text))) if not is_hidden(file))
         if not found:
             raise FileNotFoundError(f"no file fits the pattern {text}")
         return found
     return (path,)
+
+
+def is_hidden(file: Path) -> bool:
+    """Tell whether a name begins with a dot: macOS's `._NAME.tar`, or a temporary file that stayed behind."""
+    return file.name.startswith(".")
 
 
 def _check_list(paths: Sequence[Path]) -> None:
@@ -189,3 +213,11 @@ def _check_list(paths: Sequence[Path]) -> None:
         if path in seen:
             raise ValueError(f"{path} is listed twice")
         seen.add(path)
+    of_name: dict[str, Path] = {}
+    for path in map(Path, paths):
+        if path.name in of_name:
+            raise ValueError(
+                f"two shards have one name, by which their samples are called: {of_name[path.name]} and "
+                f"{path}; leave one out if it is a copy, or give it a number of its own"
+            )
+        of_name[path.name] = path

@@ -21,12 +21,15 @@ import numpy as np
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.npz_file import read_npz
 from poem_jax.io.user_cache import user_cache_folder
-from poem_jax.typing import Array, Int, UInt8
+from poem_jax.typing import Array, Int
 
-_VERSION = 1
+_VERSION = 2
 _BLOCK = 512
 _MAX_MEMBER_BYTES = 2**30
 """Of one file of a sample; ours are images and labels."""
+_DAMAGED, _EMPTY = "the shard is damaged", "the shard is empty"
+"""How faults of a whole file begin."""
+_MAX_SUFFIXES = 2**16
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +38,7 @@ class TarIndex(NamedTuple):
     """Samples of one tar file: sample i has the members `first[i]` to `first[i + 1]`."""
 
     keys: Array
-    """Names of the samples, UTF-8 bytes."""
+    """Names of the samples, bytes as in the tar."""
     start: Int[Array, " sample"]
     """Where the data of the first member begins in the file, bytes."""
     first: Int[Array, " sample+1"]
@@ -43,10 +46,10 @@ class TarIndex(NamedTuple):
     """uint32 (member,): of a member's data from `start` of its sample, bytes."""
     size: Array
     """uint32 (member,), bytes."""
-    suffix: UInt8[Array, " member"]
-    """Which of `suffixes` it has."""
+    suffix: Array
+    """uint16 (member,): which of `suffixes` it has."""
     suffixes: Array
-    """What follows the first dot of a name, in lower case, UTF-8 bytes."""
+    """What follows the first dot of a name, in lower case, bytes as in the tar."""
     faults: Array
     """Pairs (key, what is wrong), text (n, 2): samples that were left out."""
 
@@ -55,14 +58,27 @@ class TarIndex(NamedTuple):
 
     def key(self, sample: int) -> str:
         """Return the name of a sample."""
-        return bytes(self.keys[sample]).decode()
+        return shown(self.keys[sample])
 
     def members(self, sample: int) -> list[tuple[str, int, int]]:
         """Return (suffix, offset in the file, size) of every member of a sample."""
         span = slice(self.first[sample], self.first[sample + 1])
         places = self.start[sample] + self.offset[span].astype(np.int64)
-        names = [self.suffixes[code].decode() for code in self.suffix[span]]
+        names = [shown(self.suffixes[code]) for code in self.suffix[span]]
         return list(zip(names, places.tolist(), self.size[span].tolist(), strict=True))
+
+    @property
+    def ends_early(self) -> bool:
+        """Whether samples are missing that nobody can name, as the file is damaged or empty."""
+        return any(str(problem).startswith((_DAMAGED, _EMPTY)) for _, problem in self.faults)
+
+    @property
+    def end(self) -> int:
+        """Where the data of the last sample end in the file, bytes."""
+        if not len(self):
+            return 0
+        span = slice(self.first[-2], self.first[-1])
+        return int(self.start[-1] + (self.offset[span].astype(np.int64) + self.size[span]).max())
 
     def digest(self) -> str:
         """Return a checksum of the names and places of all samples."""
@@ -72,11 +88,17 @@ class TarIndex(NamedTuple):
         return digest.hexdigest()[:32]
 
 
+def shown(name: bytes) -> str:
+    """Return a name of a tar as text that can be printed; bytes that are no UTF-8 appear as `\\xe9`."""
+    return bytes(name).decode(errors="backslashreplace")
+
+
 def tar_index(path: str | Path) -> TarIndex:
     """Return the index of a tar file, from its cache where that still holds.
 
     Raises:
         FileNotFoundError: no such file.
+        ValueError: as `build_index`.
     """
     path = Path(path)
     if not path.is_file():
@@ -98,6 +120,7 @@ def build_index(path: Path) -> TarIndex:
 
     Raises:
         OSError: it cannot be read.
+        ValueError: more than 65,536 different endings of names.
     """
     faults: list[tuple[str, str]] = []
     groups = _whole_samples(_groups(path, faults), faults)
@@ -106,18 +129,35 @@ def build_index(path: Path) -> TarIndex:
     start = np.array([group[0].place for _, group in groups], np.int64)
     first = np.cumsum([0, *(len(group) for _, group in groups)], dtype=np.int32)
     suffixes = sorted({member.suffix for member in members})
+    if len(suffixes) > _MAX_SUFFIXES:
+        raise ValueError(
+            f"{path} holds files of {len(suffixes)} different endings, as .{shown(_bytes(suffixes[0]))[:100]}"
+            "; the name of a sample ends at the first dot of a file's name, so it can hold none itself: "
+            "rename the files"
+        )
     code = {suffix: i for i, suffix in enumerate(suffixes)}
     places = np.array([member.place for member in members], np.int64)
     return TarIndex(
-        keys=np.array([key.encode() for key in keys], np.bytes_) if keys else np.zeros(0, "S1"),
+        keys=_stored(keys),
         start=start,
         first=first,
         offset=(places - np.repeat(start, np.diff(first))).astype(np.uint32),
         size=np.array([member.size for member in members], np.uint32),
-        suffix=np.array([code[member.suffix] for member in members], np.uint8),
-        suffixes=np.array([s.encode() for s in suffixes], np.bytes_) if suffixes else np.zeros(0, "S1"),
-        faults=np.array(faults, np.str_).reshape(-1, 2),
+        suffix=np.array([code[member.suffix] for member in members], np.uint16),
+        suffixes=_stored(suffixes),
+        faults=np.array([[shown(_bytes(text)) for text in fault] for fault in faults], np.str_).reshape(
+            -1, 2
+        ),
     )
+
+
+def _stored(names: list[str]) -> Array:
+    return np.array([_bytes(name) for name in names], np.bytes_) if names else np.zeros(0, "S1")
+
+
+def _bytes(name: str) -> bytes:
+    """Undo what `tarfile` does to names that are no UTF-8."""
+    return name.encode(errors="surrogateescape")
 
 
 class _Member(NamedTuple):
@@ -147,9 +187,9 @@ def _groups(path: Path, faults: list[tuple[str, str]]) -> list[_Group]:
                 groups = groups[: -1 if groups[-1][0] == error.key else None]
     if cut is not None:
         last = f"the last sample before is {groups[-1][0]}" if groups else "no sample is whole"
-        faults.append((groups[-1][0] if groups else "-", f"the shard is damaged: {cut}; {last}"))
+        faults.append((groups[-1][0] if groups else "-", f"{_DAMAGED}: {cut}; {last}"))
     elif not groups:
-        faults.append(("-", "the shard is empty: it holds no file"))
+        faults.append(("-", f"{_EMPTY}: it holds no file"))
     return groups
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from poem_jax.data.capture_folder import RIG_FILES
+from poem_jax.data.shards import is_hidden
 from poem_jax.mixture.config import (
     ArcticSource,
     CapturesSource,
@@ -95,9 +96,8 @@ def source_at(path: str | Path, kind: Kind, *, split: str | None, mano: str | Pa
     if kind is Kind.CAPTURE:
         if split is not None:
             raise ValueError(f"a capture has no splits; got --split {split}")
-        return CapturesSource((root,))
-    if split is None:
-        split = "train+val" if kind is Kind.OAKINK else "train"
+        return CapturesSource((root,), mano=hand)
+    split = training_split(kind) if split is None else split
     if kind is Kind.OAKINK:
         return OakInkSource(root, mano=hand, split=split)
     if kind is Kind.FREIHAND:
@@ -116,9 +116,14 @@ def source_at(path: str | Path, kind: Kind, *, split: str | None, mano: str | Pa
     return InterHandSource(root, hand, split=split)
 
 
+def training_split(kind: Kind) -> str:
+    """Return the split of a raw set that the paper trains on."""
+    return "train+val" if kind is Kind.OAKINK else "train"
+
+
 def _is(kind: Kind, folder: Path) -> bool:
     if kind is Kind.TARS:
-        return any(folder.glob("*.tar"))
+        return any(not is_hidden(file) for file in folder.glob("*.tar"))
     if kind is Kind.CAPTURE:
         return any((folder / name).is_file() for name in RIG_FILES)
     places = (folder, *(folder / name for name in _NAMES[kind]))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from poem_jax.cli import main
+from poem_jax.mixture.config import CapturesSource
 from poem_jax.mixture.recognise import Kind, recognise, source_at
 from tests.data.sources.test_captures import write_capture
 
@@ -55,10 +56,20 @@ def plant(root, names):
         (root / name).write_bytes(b"")
 
 
+def test_hidden_files_make_no_folder_of_tars(tmp_path):
+    plant(tmp_path, [*TREES[Kind.FREIHAND], "._DexYCB_mv_test-000000.tar"])
+    assert recognise(tmp_path) is Kind.FREIHAND
+
+
 @pytest.mark.parametrize("kind", TREES, ids=str)
 def test_folders_are_recognised_by_what_lies_in_them(kind, tmp_path):
     plant(tmp_path, TREES[kind])
     assert recognise(tmp_path) is kind
+
+
+def test_a_capture_is_opened_with_the_users_mano(tmp_path):
+    source = source_at(tmp_path, Kind.CAPTURE, split=None, mano="MANO_LEFT.pkl")
+    assert source == CapturesSource((str(tmp_path),), mano="MANO_LEFT.pkl")
 
 
 def test_patterns_and_files_of_tars_are_tars():

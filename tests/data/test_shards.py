@@ -173,3 +173,46 @@ def test_the_fingerprint_names_the_shard_that_changed(tmp_path):
     write_tar(shards[1], [plain_sample(5)])
     after = ShardSet(shards).fingerprint()
     assert [name for name in before if before[name] != after[name]] == ["1.tar"]
+
+
+def test_hidden_files_are_no_shards(tmp_path):
+    """macOS puts `._NAME` beside a copied file, and a run that was killed leaves `.NAME.1a2b3c4d.tar`."""
+    shard = write_tar(tmp_path / "D_mv_train-000000.tar", [plain_sample(0)])
+    for name in ("._D_mv_train-000000.tar", ".D_mv_train-000001.1a2b3c4d.tar"):
+        (tmp_path / name).write_bytes(b"\0\5\26\7")
+    assert expand_shards(tmp_path) == (shard,)
+    assert expand_shards(f"{tmp_path}/*.tar") == (shard,)
+    assert expand_shards(f"{tmp_path}/*D_mv_*") == (shard,)
+
+
+def test_two_shards_of_one_name_are_refused(tmp_path):
+    shards = [write_tar(tmp_path / of / "D_mv_train-000000.tar", [plain_sample(0)]) for of in ("a", "b")]
+    with pytest.raises(ValueError, match=r"two shards have one name.*a/D_mv_train.* and .*b/D_mv_train"):
+        ShardSet(shards)
+
+
+def test_keys_with_dots_make_many_endings(tmp_path, monkeypatch):
+    """Their samples cannot be told apart, which is named; up to then they are only endings."""
+    files = {f"{number:06d}.jpg": b"x" for number in range(300)}
+    shard = write_tar(tmp_path / "a.tar", [("frame", files)])
+    for _ in ("built", "cached"):
+        assert ShardSet([shard]).read(0) == files
+    monkeypatch.setattr(tar_index_module, "_MAX_SUFFIXES", 256)
+    with pytest.raises(
+        ValueError, match=r"a\.tar holds files of 300 different endings.*can hold none itself"
+    ):
+        tar_index_module.build_index(shard)
+
+
+@pytest.mark.parametrize("format", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
+def test_names_that_are_no_utf8_are_read_and_can_be_printed(tmp_path, format):
+    key = b"caf\xe9".decode("utf-8", "surrogateescape")
+    bad = b"t\xe9".decode("utf-8", "surrogateescape")
+    shard = write_tar(
+        tmp_path / "a.tar", [(key, {"a.b": b"1", "label.pyd": b"2"}), (bad, {"a": b"3"})], format=format
+    )
+    for _ in ("built", "cached"):
+        found = ShardSet([shard], required="label.pyd")
+        assert found.read(0) == {"a.b": b"1", "label.pyd": b"2"}
+        assert found.locate(0)[1].encode() == rb"caf\xe9"
+        assert str(found.faults[0]).encode().endswith(rb"a.tar, sample t\xe9: it has no label.pyd")
