@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from poem_jax.cli.messages import say, tells_what_is_left
-from poem_jax.cli.options import Flag, Folder, OptionalFile
+from poem_jax.cli.options import Flag, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -23,18 +23,22 @@ class Pack:
     """Write a raw data set once into tar shards of the kind that POEM v2 was trained from.
 
     Stopped, the same command goes on where it was. Samples that cannot be used are left out and named.
+    With --check DIR nothing is packed: the shards in DIR, copied there from anywhere, are compared with the
+    checksums in their manifests.
     """
 
-    name: Annotated[RawSet, tyro.conf.Positional]
+    name: Annotated[RawSet | None, tyro.conf.Positional] = None
     """Data set."""
-    root: Folder
+    root: OptionalFolder = None
     """Folder of the data set."""
-    out: Folder
+    out: OptionalFolder = None
     """Folder for the shards and their manifest, `SET_mv_SPLIT.manifest.json`."""
+    check: OptionalFolder = None
+    """Compare the shards in this folder with their manifests, and do nothing else."""
     mano: OptionalFile = None
     """The user's MANO_RIGHT.pkl; only oakink and freihand do without."""
-    split: str = "train"
-    """Split, as the data set calls it."""
+    split: str | None = None
+    """Split, as the data set calls it; without it the one that the paper trains on."""
     setup: str | None = None
     """Of dexycb (s0, s1, s3), oakink (SP2) and arctic (p1); without it the paper's."""
     workers: int = 1
@@ -45,40 +49,80 @@ class Pack:
     """Show the full traceback of an error."""
 
     def run(self) -> None:
-        """Write the shards and print how many samples they hold."""
+        """Write the shards and print how many samples they hold; or check those that are there."""
+        if self.check is not None:
+            self._check(self.check)
+            return
+        if self.name is None or self.root is None or self.out is None:
+            raise ValueError("say what to pack: NAME, --root DIR and --out DIR; or --check DIR")
+        self._pack(self.name, self.root, self.out)
+
+    def _pack(self, name: RawSet, root: Path, out: Path) -> None:
         from tqdm import tqdm
 
         from poem_jax.data.pack import pack
         from poem_jax.io.writable import check_folder_is_writable
+        from poem_jax.mixture.recognise import Kind, training_split
 
         start = time.perf_counter()
-        check_folder_is_writable(self.out)
-        say(f"listing {self.name} in {self.root}")
-        source, set_name = self._open()
+        check_folder_is_writable(out)
+        split = self.split or training_split(Kind(name))
+        say(f"listing {name} {split} in {root}")
+        source, set_name = self._open(name, root, split)
         with (
-            tells_what_is_left(self.out),
+            tells_what_is_left(out),
             tqdm(total=len(source), unit="sample", desc="packing") as bar,
         ):
             packed = pack(
                 source,
-                self.out,
+                out,
                 set_name=set_name,
-                split=_RELEASED_SPLITS.get((self.name, self.split), self.split),
+                split=_RELEASED_SPLITS.get((name, split), split),
                 mano=self.mano,
                 samples_per_shard=self.samples_per_shard,
                 workers=self.workers,
                 progress=lambda done, _: _advance(bar, done),
             )
-        print(f"{packed.samples} samples in {len(packed.shards)} shards in {self.out}")
+        print(f"{packed.samples} samples in {len(packed.shards)} shards in {out}")
         if packed.skipped:
             print(f"{len(packed.skipped)} samples were left out; {packed.manifest} names them")
         print(f"checksums and counts: {packed.manifest}")
         print(f"done in {time.perf_counter() - start:.1f} s")
 
-    def _open(self) -> "tuple[FrameSource, str]":
+    def _check(self, folder: Path) -> None:
+        """Compare checksums.
+
+        Raises:
+            FileNotFoundError: There is no manifest.
+            ValueError: Shards are missing or have changed, or another option was given.
+        """
+        from poem_jax.data.manifest import check_shards, read_manifest
+
+        if self != Pack(check=folder, debug=self.debug):
+            raise ValueError("--check DIR stands alone: it packs nothing")
+        places = sorted(place for place in folder.glob("*.manifest.json") if not place.name.startswith("."))
+        if not places:
+            raise FileNotFoundError(
+                f"no SET_mv_SPLIT.manifest.json in {folder}; give the folder of the shards"
+            )
+        problems = []
+        for place in places:
+            manifest = read_manifest(place)
+            found = check_shards(manifest, folder)
+            shards = [entry for entry in manifest.shards.values() if entry.samples]
+            samples = sum(entry.samples for entry in shards)
+            verdict = f"{len(found)} problems" if found else "all as packed"
+            print(f"{place.name}: {len(shards)} shards, {samples} samples, {verdict}")
+            problems += found
+        if problems:
+            raise ValueError(
+                f"what is in {folder} is not what was packed: {'; '.join(problems)}. Copy those files anew, "
+                "or repeat the command that packed them, which writes only them"
+            )
+
+    def _open(self, name: RawSet, root: Path, split: str) -> "tuple[FrameSource, str]":
         """Return the source, and what its tars are called."""
-        root, split = self.root, self.split
-        match self.name:
+        match name:
             case "dexycb":
                 from poem_jax.data.sources.dexycb import DexYCB
 
@@ -94,8 +138,8 @@ class Pack:
                 setup, mano = self._setup("p1"), self._need_mano()
                 return Arctic(root, split=split, setup=setup, mano=mano), "Arctic"
         if self.setup is not None:
-            raise ValueError(f"{self.name} has no setups; leave --setup out")
-        match self.name:
+            raise ValueError(f"{name} has no setups; leave --setup out")
+        match name:
             case "interhand":
                 from poem_jax.data.sources.interhand import InterHand
 
@@ -107,7 +151,7 @@ class Pack:
             case "ho3d-v2" | "ho3d-v3":
                 from poem_jax.data.sources.ho3d import HO3D
 
-                version = self.name.removeprefix("ho3d-")
+                version = name.removeprefix("ho3d-")
                 return HO3D(root, split=split, version=version, mano=self._need_mano()), "HO3D"
 
     def _setup(self, of_paper: str) -> str:

@@ -85,6 +85,9 @@ def read_manifest(path: Path) -> Manifest:
 def check_shards(manifest: Manifest, folder: Path) -> list[str]:
     """Return what is wrong with the shards of a manifest, a line each, by their checksums."""
     problems = []
+    expected = -(-manifest.samples // manifest.samples_per_shard)
+    if len(manifest.shards) < expected:
+        problems.append(f"{expected - len(manifest.shards)} of {expected} shards are not packed yet")
     for name, entry in manifest.shards.items():
         path = folder / name
         if not entry.samples:

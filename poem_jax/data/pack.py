@@ -6,14 +6,18 @@ Images stay the bytes that they are; labels are written in the data set's own re
 is written whole, then named, then entered in the manifest; a second run goes on where the first one ended.
 """
 
+import glob
 import hashlib
 import io
 import logging
 import multiprocessing
+import multiprocessing.connection
+import os
 import pickle
 import re
 import signal
 import tarfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -92,6 +96,7 @@ def pack(
     place = out / f"{stem}.manifest.json"
     manifest = Manifest(source.name, dict(source.fingerprint()), len(source), samples_per_shard)
     manifest = _go_on(manifest, place, out)
+    _remove_temporaries(out, stem)
     count = -(-len(source) // samples_per_shard)
     paths = [out / f"{stem}-{shard:06d}.tar" for shard in range(count)]
     left = [shard for shard in range(count) if paths[shard].name not in manifest.shards]
@@ -105,6 +110,17 @@ def pack(
         if progress is not None:
             progress(done, len(source))
     return _packed(manifest, out, place)
+
+
+def _remove_temporaries(out: Path, stem: str) -> None:
+    """Remove what an earlier run of this set and split left when it was killed in the middle of a shard."""
+    temporary = re.compile(
+        rf"\.{re.escape(stem)}(-\d{{6}}\.[0-9a-f]{{8}}\.tar|\.manifest\.[0-9a-f]{{8}}\.json)"
+    )
+    for path in out.glob(f".{glob.escape(stem)}*"):
+        if temporary.fullmatch(path.name):
+            _log.info("removing %s, which was never finished", path)
+            path.unlink()
 
 
 def _packed(manifest: Manifest, out: Path, place: Path) -> Packed:
@@ -132,7 +148,11 @@ def _go_on(manifest: Manifest, place: Path, out: Path) -> Manifest:
 
 
 def _is_there(path: Path, entry: ShardEntry) -> bool:
-    return not entry.samples or (path.is_file() and path.stat().st_size == entry.bytes)
+    if not entry.samples:
+        return True
+    if not path.is_file() or path.stat().st_size != entry.bytes:
+        return False
+    return sha256_of(path) == entry.sha256
 
 
 def _span(task: _Task, shard: int) -> range:
@@ -172,6 +192,15 @@ def _start_worker(task: _Task) -> None:
     _task = task
     # Ctrl-C reaches the whole group; the parent decides what ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent is gone: a parent that was killed cannot say so."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    multiprocessing.connection.wait([parent.sentinel])
+    os._exit(1)
 
 
 def _write_in_worker(shard: int, path: Path) -> ShardEntry:

@@ -35,7 +35,8 @@ def test_pack_writes_shards_that_are_read_and_says_what_it_left_out(tmp_path, ca
     out = tmp_path / "out"
     command = ["pack", "freihand", "--root", str(tmp_path), "--out", str(out), "--split", "test"]
     assert main([*command, "--samples-per-shard", "2"]) == 0
-    assert freihand == [(tmp_path, {"mano": None, "split": "test"})]
+    ((root, options),) = freihand
+    assert (root, options["split"], options["mano"]) == (tmp_path, "test", None)
     printed = capsys.readouterr().out
     assert f"2 samples in 2 shards in {out}" in printed
     assert "1 samples were left out; " in printed
@@ -54,6 +55,49 @@ def test_pack_writes_shards_that_are_read_and_says_what_it_left_out(tmp_path, ca
 def test_what_is_missing_is_asked_for(tmp_path, capsys, options, words):
     command = ["pack", *options, "--root", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(command) == USAGE_ERROR
+    assert words in capsys.readouterr().err
+
+
+def test_without_a_split_the_papers_is_packed(tmp_path, monkeypatch, freihand):
+    from poem_jax.data.sources import oakink
+
+    splits = []
+    monkeypatch.setattr(
+        oakink, "OakInk", lambda root, **options: splits.append(options["split"]) or MemorySource(1)
+    )
+    for name in ("oakink", "freihand"):
+        assert main(["pack", name, "--root", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    assert (splits, freihand[0][1]["split"]) == (["train+val"], "train")
+    shards = [path.name for path in (tmp_path / "out").glob("*.tar")]
+    assert sorted(shards) == ["Freihand_mv_train-000000.tar", "Oakink_mv_train+val-000000.tar"]
+
+
+def test_check_names_the_shards_that_are_not_what_was_packed(tmp_path, capsys, freihand):
+    out = str(tmp_path / "out")
+    assert main(["pack", "freihand", "--root", str(tmp_path), "--out", out, "--samples-per-shard", "1"]) == 0
+    assert main(["pack", "--check", out]) == 0
+    assert "Freihand_mv_train.manifest.json: 2 shards, 2 samples, all as packed" in capsys.readouterr().out
+    shards = sorted((tmp_path / "out").glob("*.tar"))
+    data = bytearray(shards[0].read_bytes())
+    data[-600] ^= 1
+    shards[0].write_bytes(data)
+    shards[1].unlink()
+    assert main(["pack", "--check", out]) == USAGE_ERROR
+    said = capsys.readouterr().err
+    assert f"{shards[0].name}: its bytes have changed" in said
+    assert f"{shards[1].name} is missing" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--check", "{}"), "no SET_mv_SPLIT.manifest.json in"),
+        (("freihand", "--check", "{}"), "--check DIR stands alone"),
+        (("freihand", "--root", "{}"), "say what to pack: NAME, --root DIR and --out DIR; or --check DIR"),
+    ],
+)
+def test_what_check_needs_is_said(tmp_path, capsys, options, words):
+    assert main(["pack", *(option.format(tmp_path) for option in options)]) == USAGE_ERROR
     assert words in capsys.readouterr().err
 
 

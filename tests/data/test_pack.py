@@ -1,8 +1,13 @@
 """Packing: what is written is read back, whatever the workers and however often it was interrupted."""
 
 import json
+import os
 import pickle
+import select
+import subprocess
+import sys
 import tarfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +18,7 @@ from poem_jax.data.pack import pack
 from poem_jax.data.sources.released_tars import ReleasedTars
 from tests.data.memory_source import MemorySource
 
+ROOT = Path(__file__).parents[2]
 DEXYCB = {"set_name": "DexYCB", "split": "train"}
 
 
@@ -107,6 +113,46 @@ def test_a_stopped_run_goes_on_and_ends_the_same(tmp_path, monkeypatch):
     pack(source, tmp_path / "out", **DEXYCB, samples_per_shard=2)
     assert again == [1, 2]
     assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
+
+
+def test_a_shard_of_the_same_size_but_other_bytes_is_written_again(tmp_path):
+    source = MemorySource(2)
+    packed = pack(source, tmp_path, **DEXYCB)
+    before = files_of(tmp_path)
+    data = bytearray(packed.shards[0].read_bytes())
+    data[700] ^= 1
+    packed.shards[0].write_bytes(data)
+    pack(source, tmp_path, **DEXYCB)
+    assert files_of(tmp_path) == before
+
+
+def test_what_a_killed_run_left_is_removed_and_nothing_else(tmp_path):
+    left = [".DexYCB_mv_train-000003.0a1b2c3d.tar", ".DexYCB_mv_train.manifest.0a1b2c3d.json"]
+    others = [".DexYCB_mv_train-000003.tar.index.npz", ".DexYCB_mv_test-000003.0a1b2c3d.tar", "._x.tar"]
+    for name in (*left, *others):
+        (tmp_path / name).write_bytes(b"part of a shard")
+    pack(MemorySource(1), tmp_path, **DEXYCB)
+    there = {path.name for path in tmp_path.iterdir()}
+    assert there.isdisjoint(left)
+    assert there.issuperset(others)
+
+
+def test_workers_end_when_their_parent_is_killed():
+    """The worker holds one end of a pipe; what the other end reads tells that it lives, or is gone."""
+    ours, workers = os.pipe()
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "tests.data.orphan", str(workers)], pass_fds=[workers], cwd=ROOT
+    )
+    os.close(workers)
+    try:
+        assert os.read(ours, 1) == b"!"
+        parent.kill()
+        parent.wait()
+        assert select.select([ours], [], [], 10)[0]
+        assert os.read(ours, 1) == b""
+    finally:
+        parent.kill()
+        os.close(ours)
 
 
 def test_a_shard_that_was_cut_is_written_again_and_checksums_tell_the_rest(tmp_path):
