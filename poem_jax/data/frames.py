@@ -7,12 +7,13 @@ camera's frame: which camera becomes the world is drawn later (`view_sampling.py
 was stored for that one.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from poem_jax.data.frame_agreement import disagreements
 from poem_jax.geometry.camera_checks import ROTATION_TOLERANCE, has_form_of_intrinsics, rotation_error
 from poem_jax.typing import Array, Float, Int
 
@@ -106,11 +107,26 @@ class FrameSource(Protocol):
         ...
 
 
+@runtime_checkable
+class DamagedSource(FrameSource, Protocol):
+    """A source that opens although some of its files are damaged, and says what it leaves out."""
+
+    @property
+    def faults(self) -> Sequence[CorruptSampleError]:
+        """What was found, one a sample or a file."""
+        ...
+
+    @property
+    def lost_samples(self) -> int:
+        """About how many samples it lacks for that: at least one a fault."""
+        ...
+
+
 def check_frame(frame: MultiViewFrame, path: str | Path) -> MultiViewFrame:
     """Return the frame if it can be true, and round nothing.
 
     Raises: CorruptSampleError: numbers that are not finite, K that is no camera, extrinsics that are not
-        rigid, a hand behind a camera or of a size that no hand has.
+        rigid, a hand behind a camera or of a size that no hand has, numbers that do not fit each other.
     """
     problem = next(_problems(frame), None)
     if problem is not None:
@@ -168,6 +184,13 @@ def _problems(frame: MultiViewFrame) -> Iterator[str]:
         bad = (depth.mean(-1) <= 0) | (depth.mean(-1) > FARTHEST_M)
         if bad.any():
             yield f"`{name}` lies {depth.mean(-1)[bad][0]:.3g} m before the camera in {_views(frame, bad)}"
+    yield from disagreements(
+        frame.K,
+        frame.T_cam_from_world,
+        frame.joints_cam,
+        frame.keypoints_px,
+        list(map(str, frame.view_names)),
+    )
 
 
 _TAILS = {
