@@ -20,6 +20,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from poem_jax.io.jpeg_scan import check_scans
 from poem_jax.typing import Array, UInt8
 
 MAX_PIXELS = 2**27
@@ -29,8 +30,7 @@ _MAX_BYTES = 8 * MAX_PIXELS
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 """Of the sensors whose values are stored in 16 bits."""
 _PNG_START, _JPEG_START, _EXIF_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"Exif\0\0"
-_JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
-_EXIF_MARKER, _SCAN_MARKER = 0xE1, 0xDA
+_EXIF_MARKER, _SCAN_MARKER, _RESTART_INTERVAL_MARKER = 0xE1, 0xDA, 0xDD
 _SIZE_MARKERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 """Of the segments of a JPEG that hold its size."""
 _LONE_MARKERS = {0x01, *range(0xD0, 0xD9)}
@@ -201,10 +201,7 @@ def _read_png_header(data: bytes) -> ImageHeader:
 
 def _read_jpeg_header(data: bytes) -> ImageHeader:
     """Walk over the segments, marker, length and contents, up to the scan, where the pixels begin."""
-    # OpenCV would give a part of a picture that breaks off.
-    if data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN):
-        raise ValueError("it breaks off")
-    size_wh, orientation, position = None, 1, 2
+    size_wh, orientation, restarts, position = None, 1, False, 2
     while data[position + 1] != _SCAN_MARKER:
         lead, marker = data[position : position + 2]
         if lead != 0xFF:
@@ -219,9 +216,13 @@ def _read_jpeg_header(data: bytes) -> ImageHeader:
             size_wh = (width, height)
         elif marker == _EXIF_MARKER and content.startswith(_EXIF_START):
             orientation = _orientation(content[len(_EXIF_START) :])
+        elif marker == _RESTART_INTERVAL_MARKER:
+            restarts = any(content)
         position += 2 + length
     if size_wh is None:
         raise ValueError("its size is missing")
+    # OpenCV would give a part of a picture that breaks off, or a wrong one.
+    check_scans(data, position, restarts)
     return ImageHeader(size_wh, orientation, is_jpeg=True)
 
 
