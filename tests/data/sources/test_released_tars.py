@@ -232,6 +232,7 @@ def test_one_split_is_read_at_a_time_and_names_say_what_it_is(tmp_path, frame):
 
 
 def test_the_released_counts_are_compared_where_all_shards_are_there(tmp_path, frame, caplog):
+    caplog.set_level("WARNING", "poem_jax")
     sample = label_of(frame, "DexYCB")
     for number in range(4):
         write_label(tmp_path / f"DexYCB_mv_test-{number:06d}.tar", sample)
