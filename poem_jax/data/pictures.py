@@ -146,7 +146,7 @@ def _decode_turbo(data: bytes, header: ImageHeader, name: str, eighths: int) -> 
     width, height = (-(-side * eighths // EIGHTHS) for side in header.size_wh)
     least = {} if eighths == EIGHTHS else {"min_width": width, "min_height": height}
     try:
-        rgb = simplejpeg.decode_jpeg(data, colorspace="RGB", **least)
+        rgb = simplejpeg.decode_jpeg(data, colorspace="RGB", strict=True, **least)
     except ValueError as error:
         raise ValueError(f"{name} cannot be read as an image ({len(data)} bytes): {error}") from error
     if rgb.shape != (height, width, 3):
