@@ -112,20 +112,22 @@ def test_left_hands_are_dropped_or_mirrored(tmp_path, mano):
 
 @pytest.mark.parametrize("faulty", [False, True])
 def test_a_left_hand_has_a_shape_unless_its_labels_need_the_faulty_directions(tmp_path, mano, faulty):
-    write_dexycb(tmp_path, sequences=1, side="left")
+    planted = write_dexycb(tmp_path, sequences=1, side="left")
     left = write_mano(tmp_path / "MANO_LEFT.pkl", side="left")
     hand = stand_in_hand("left")
     if faulty:
         hand = hand._replace(shapedirs=hand.shapedirs * np.array([-1, 1, 1], np.float32)[:, None])
     source = DexYCB(tmp_path, mano=mano, left=True, mano_left=left)
     betas = source._sequences[0].betas
+    resting_wrist = hand_mesh(hand, np.zeros((16, 3), np.float32), betas).joints[0]
     for path in tmp_path.rglob("labels_*.npz"):
-        arrays = dict(np.load(path))
+        arrays, view = dict(np.load(path)), SERIALS.index(path.parent.name)
         pose_m = arrays["pose_m"]
+        pose_m[0, 48:] = planted.joints_cam[view, 0] - resting_wrist
         pose = stand_in_components("left").pose(pose_m[:, :3], pose_m[:, 3:48])
         joints = hand_mesh(hand, pose[0], betas, pose_m[0, 48:]).joints
-        K = source._K[SERIALS.index(path.parent.name)]
-        changed = {"joint_3d": joints[None], "joint_2d": project_cam(K, joints)[None] - 0.5}
+        pixels = project_cam(source._K[view], joints)
+        changed = {"joint_3d": joints[None], "joint_2d": pixels[None] - 0.5, "pose_m": pose_m}
         np.savez(path, **{**arrays, **{name: value.astype(np.float32) for name, value in changed.items()}})
     frame = source[0]
     assert frame.mirror_px is not None
