@@ -78,8 +78,12 @@ class Inspect:
         planted = WRITERS[name](out)
         mano = write_mano(out / _MANO)
         say(f"wrote {len(planted)} samples to {out}")
-        kind = Kind.TARS if name.startswith("tars-") else Kind(name)
-        self._show(source_at(out, kind, split=self.split, mano=mano).open(), mano, out / SHEET)
+        if name.startswith("tars-"):
+            # In folders by set, as the authors' archives are unpacked.
+            source = source_at(out / "*" / "*.tar", Kind.TARS, split=self.split or "train", mano=mano)
+        else:
+            source = source_at(out, Kind(name), split=self.split, mano=mano)
+        self._show(source.open(), mano, out / SHEET)
 
     def _show(self, source: "FrameSource", mano: Path | None, sheet: Path | None) -> None:
         from poem_jax.data.frames import CorruptSampleError

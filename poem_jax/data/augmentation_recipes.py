@@ -39,8 +39,8 @@ class Recipe:
     """Spread of the angle by which an image is turned."""
     turn_probability: float = 1.0
     first_view_turns: bool = False
-    clip_at: float = math.inf
-    """Normal numbers of centre, scale and turn are held to so many spreads."""
+    clip_at: float | None = None
+    """Normal numbers of centre, scale and turn are held to so many spreads; None = they are not."""
     gain: float = 0.0
     """Each channel is multiplied by 1 - gain .. 1 + gain."""
     occlusion_probability: float = 0.0
@@ -111,7 +111,9 @@ def draw(recipe: Recipe, num_views: int, rng: np.random.Generator) -> Draws:
 
     As many are drawn whatever the recipe's constants are.
     """
-    normal = np.clip(rng.standard_normal((num_views, 4)), -recipe.clip_at, recipe.clip_at)
+    normal = rng.standard_normal((num_views, 4))
+    if recipe.clip_at is not None:
+        normal = np.clip(normal, -recipe.clip_at, recipe.clip_at)
     turned = rng.uniform(size=num_views) <= recipe.turn_probability
     if not recipe.first_view_turns:
         turned[0] = False

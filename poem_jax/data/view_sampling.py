@@ -18,8 +18,17 @@ RELEASE_MEAN, RELEASE_SPREAD = 4.0, 2.0
 class ViewSampling(Protocol):
     """A rule by which views are drawn."""
 
-    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
-        """Return indices below `num_views`, each at most once; the first is the primary view."""
+    def draw(
+        self, num_views: int, rng: np.random.Generator, most: int | None = None
+    ) -> Int[Array, " chosen"]:
+        """Return indices below `num_views`, each at most once; the first is the primary view.
+
+        Args:
+            num_views: of the frame.
+            rng: chance.
+            most: there is room for so many only. Numbers of views are drawn for that, and not cut to it:
+                else most samples would have `most`.
+        """
         ...
 
 
@@ -34,17 +43,19 @@ class UniformViews:
     def __post_init__(self) -> None:
         _check_range(self.min, self.max)
 
-    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+    def draw(
+        self, num_views: int, rng: np.random.Generator, most: int | None = None
+    ) -> Int[Array, " chosen"]:
         """Draw; see `ViewSampling`."""
-        high = num_views if self.max is None else min(self.max, num_views)
+        high = min(limit for limit in (self.max, num_views, most) if limit is not None)
         order = rng.permutation(num_views)
         return order[: rng.integers(min(self.min, high), high, endpoint=True)]
 
 
 @dataclass(frozen=True)
 class ReleaseNormalViews:
-    """POEM v2's released rule: a rounded N(4, 2), held to `low` .. `high`, then to what there is, in random
-    order.
+    """POEM v2's released rule: a rounded N(4, 2), held to `low` .. `high`, then to what there is and has
+    room, in random order.
 
     Its evaluations with n views are `ReleaseNormalViews(n, n)`: order and primary view are random there too.
     """
@@ -55,20 +66,24 @@ class ReleaseNormalViews:
     def __post_init__(self) -> None:
         _check_range(self.low, self.high)
 
-    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+    def draw(
+        self, num_views: int, rng: np.random.Generator, most: int | None = None
+    ) -> Int[Array, " chosen"]:
         """Draw; see `ViewSampling`."""
         order = rng.permutation(num_views)
-        count = round(rng.normal(RELEASE_MEAN, RELEASE_SPREAD))
-        return order[: min(max(count, self.low), self.high)]
+        count = min(max(round(rng.normal(RELEASE_MEAN, RELEASE_SPREAD)), self.low), self.high)
+        return order[: count if most is None else min(count, most)]
 
 
 @dataclass(frozen=True)
 class AllViews:
     """POEM v1's rule: all views in the frame's own order, whose first is the constant master."""
 
-    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
-        """Return all; nothing is drawn."""
-        return np.arange(num_views)
+    def draw(
+        self, num_views: int, rng: np.random.Generator, most: int | None = None
+    ) -> Int[Array, " chosen"]:
+        """Return all, or the first `most`; nothing is drawn."""
+        return np.arange(num_views if most is None else min(num_views, most))
 
 
 @dataclass(frozen=True)
@@ -80,9 +95,11 @@ class FixedViews:
     def __post_init__(self) -> None:
         _check_range(self.count, None)
 
-    def draw(self, num_views: int, rng: np.random.Generator) -> Int[Array, " chosen"]:
+    def draw(
+        self, num_views: int, rng: np.random.Generator, most: int | None = None
+    ) -> Int[Array, " chosen"]:
         """Return the first ones; nothing is drawn."""
-        return np.arange(min(self.count, num_views))
+        return AllViews().draw(min(self.count, num_views), rng, most)
 
 
 def _check_range(low: int, high: int | None) -> None:

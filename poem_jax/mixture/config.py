@@ -4,6 +4,7 @@
 like all of `mixture/`, loads no JAX: worker processes get what is opened here.
 """
 
+import enum
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -149,12 +150,20 @@ class CapturesSource:
     """Your own captures with labels, such as `poem fit` writes."""
 
     folders: tuple[str, ...]
+    labels: tuple[str, ...] | None = None
+    """File of labels of each folder; None = the one that lies in it."""
+    mano: str | None = None
+    """MANO_RIGHT.pkl or MANO_LEFT.pkl, for labels with pose and shape but no vertices."""
+    max_reprojection_px: float | None = None
+    """Leave out views where a fit is farther than this from its key points, on average; None = keep them."""
 
     def open(self) -> FrameSource:
         """List the frames of the captures."""
         from poem_jax.data.sources.captures import Captures
 
-        return Captures(self.folders)
+        return Captures(
+            self.folders, labels=self.labels, mano=self.mano, max_reprojection_px=self.max_reprojection_px
+        )
 
 
 @dataclass(frozen=True)
@@ -176,6 +185,14 @@ FramesSource: TypeAlias = (
 AnySource: TypeAlias = FramesSource | SyntheticSource
 
 
+class ImageDecoder(enum.Enum):
+    """What decodes images; see `data/pictures.py`."""
+
+    OPENCV = "opencv"
+    TURBO = "turbo"
+    """libjpeg-turbo, by the extra `turbo`: refuses more damaged JPEGs, and can shrink while it decodes."""
+
+
 @dataclass(frozen=True)
 class Part:
     """One source and its share."""
@@ -184,7 +201,7 @@ class Part:
     weight: float = 1.0
     """How often it is drawn, relative to the others."""
     views: ViewSampling = UniformViews()
-    """How many of a frame's views a sample has, and in which order; a batch takes the first `num_views`."""
+    """How many of a frame's views a sample has, and in which order; at most the `num_views` of its batch."""
 
     def __post_init__(self) -> None:
         if not self.weight > 0:
@@ -198,6 +215,8 @@ class MixtureConfig:
     parts: tuple[Part, ...]
     recipe: Recipe = PAPER
     """Augmentation of all but synthetic captures."""
+    decoder: ImageDecoder = ImageDecoder.OPENCV
+    """Of their images. Pixels differ a little between the two."""
     pose: bool = False
     """Samples carry pose and shape, for parametric models; every source must have them then."""
     max_corrupt_share: float = 0.01
@@ -212,6 +231,11 @@ class MixtureConfig:
             raise ValueError(
                 "`mixture.max_corrupt_share` must lie in 0..1 and `mixture.processes` be at least 0; got "
                 f"{self.max_corrupt_share} and {self.processes}"
+            )
+        if self.recipe.shrinks_while_decoding and self.decoder is ImageDecoder.OPENCV:
+            raise ValueError(
+                "`mixture.recipe.shrinks_while_decoding` needs a decoder that can: `mixture.decoder` TURBO; "
+                "got OPENCV"
             )
         least = min(self.shares)
         if least < LEAST_SHARE:

@@ -12,17 +12,25 @@ Fingerprints = Mapping[str, Mapping[str, str]]
 _MOST = 10
 
 
-def check_files(file: Path, now: Fingerprints, *, allow_change: bool) -> None:
+def check_files(file: Path, now: Fingerprints, *, allow_change: bool, begun: bool) -> None:
     """Store the fingerprints of a run's data, or insist that they are those that are stored.
 
     Args:
         file: `data_files.json` of the run.
         now: fingerprints of the parts, by name.
         allow_change: take the new ones instead.
+        begun: the run has a checkpoint already.
 
     Raises:
-        ValueError: files have changed, come or gone since the run began; names them.
+        ValueError: files have changed, come or gone since the run began; names them. Or the run has begun
+            and nobody knows with which files.
     """
+    if begun and not allow_change and not file.is_file():
+        raise ValueError(
+            f"the run of {file.parent} has checkpoints, but {file.name} is gone, which says what data it "
+            "began with. Bring it back, choose another --train.out, or pass --train.allow-config-change to "
+            "go on with the data there are now"
+        )
     if file.is_file():
         changed = _changes(_stored(file), now)
         if changed and not allow_change:

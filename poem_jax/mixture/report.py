@@ -10,7 +10,7 @@ from typing import Any
 
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.json_file import read_json
-from poem_jax.mixture.samples import Drawn
+from poem_jax.mixture.samples import Drawn, LeftOut
 
 LEAST_SAMPLES = 100
 """Before the share of corrupt ones counts."""
@@ -39,27 +39,25 @@ class DataReport:
         self._drawn = [0] * len(self._names)
         self._corrupt = [0] * len(self._names)
         self._named: dict[tuple[int, str], str] = {}
-        self._left_out: dict[str, list[str]] = {}
+        self._left_out: dict[str, LeftOut] = {}
         self._lock = threading.Lock()
         self._written_at = -_PAUSE_S
 
-    def note_left_out(self, part: int, problems: Sequence[str], samples: int) -> None:
-        """Name what a source of so many samples had to leave out when it was opened (shards cut off).
+    def note_left_out(self, part: int, left_out: LeftOut) -> None:
+        """Name what a source had to leave out when it was opened (shards cut off); it has logged that itself.
 
         Raises:
             TooManyCorruptSamples: it is more than the limit's share, of 100 or more.
         """
-        name, all_samples = self._names[part], samples + len(problems)
-        for problem in problems:
-            _log.warning("left out of %s: %s", name, problem)
-        if not problems:
+        if not left_out.problems:
             return
-        self._left_out[name] = list(problems)
+        name, all_samples = self._names[part], left_out.samples + left_out.lost
+        self._left_out[name] = left_out
         self.write()
-        if all_samples >= LEAST_SAMPLES and len(problems) > self._limit * all_samples:
+        if all_samples >= LEAST_SAMPLES and left_out.lost > self._limit * all_samples:
             raise TooManyCorruptSamples(
-                f"{len(problems)} of {all_samples} samples of {name} had to be left out, more than "
-                f"{self._limit_in_words()}: {problems[0]}. {self._remedy()}"
+                f"about {left_out.lost} of {all_samples} samples of {name} had to be left out, more than "
+                f"{self._limit_in_words()}: {left_out.problems[0]}. {self._remedy()}"
             )
 
     def note(self, drawn: Iterable[Drawn]) -> None:
@@ -110,7 +108,8 @@ class DataReport:
                 name: {
                     "samples": self._drawn[part],
                     "corrupt": self._corrupt[part],
-                    "left_out": self._left_out.get(name, []),
+                    "lost": self._lost(name).lost,
+                    "left_out": self._lost(name).problems[:MOST_NAMED],
                     "corrupt_samples": {
                         key: problem for (of, key), problem in self._named.items() if of == part
                     },
@@ -118,6 +117,9 @@ class DataReport:
                 for part, name in enumerate(self._names)
             }
         }
+
+    def _lost(self, name: str) -> LeftOut:
+        return self._left_out.get(name, LeftOut(0))
 
     def _worst(self) -> str:
         counts = [

@@ -8,7 +8,8 @@ import numpy as np
 from poem_jax.batch import MultiViewBatch
 from poem_jax.data.augmentation import augment
 from poem_jax.data.augmentation_recipes import Recipe
-from poem_jax.data.frames import CorruptSampleError, FrameSource
+from poem_jax.data.frames import CorruptSampleError, DamagedSource, FrameSource
+from poem_jax.data.pictures import Decoder, decoder
 from poem_jax.mixture.config import MixtureConfig, SyntheticSource, ViewSampling
 from poem_jax.mixture.schedule import Schedule, frame_at
 from poem_jax.synthetic.config import SyntheticConfig
@@ -40,11 +41,25 @@ class Drawn(NamedTuple):
     skipped: tuple[Skipped, ...] = ()
 
 
+class LeftOut(NamedTuple):
+    """What a part lacked when it was opened."""
+
+    samples: int
+    """Those it has."""
+    lost: int = 0
+    """About how many more it should have."""
+    problems: tuple[str, ...] = ()
+    """One a damaged file or sample."""
+
+
 @runtime_checkable
 class Samples(Protocol):
     """A part of the mixture, with its own way from a number to a sample."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """In logs, reports and errors."""
+        ...
 
     def frame(self, seed: int, part: int, number: int, attempt: int) -> int:
         """Return the index of the part's sample `number`."""
@@ -61,8 +76,8 @@ class Samples(Protocol):
         """Return what identifies the files."""
         ...
 
-    def left_out(self) -> tuple[list[str], int]:
-        """Return what was found missing when the part was opened, and how many samples there are."""
+    def left_out(self) -> LeftOut:
+        """Return what was found missing when the part was opened."""
         ...
 
 
@@ -75,6 +90,8 @@ class FrameSamples:
     recipe: Recipe
     image_hw: tuple[int, int]
     pose: bool
+    decoder: Decoder | None = None
+    """None = OpenCV."""
 
     @property
     def name(self) -> str:
@@ -86,24 +103,27 @@ class FrameSamples:
         return frame_at(seed, part, number, len(self.source), attempt)
 
     def sample(self, index: int, most_views: int, rng: np.random.Generator) -> MultiViewBatch:
-        """Read a frame, draw its views (at most the first `most_views` of the draw), augment.
+        """Read a frame, draw its views, augment.
 
         Raises:
             CorruptSampleError: the frame cannot be used.
             ValueError: it has no pose, and the mixture's samples must.
         """
         frame = self.source[index]
-        chosen = self.views.draw(len(frame.images), rng)[:most_views]
-        sample = augment(frame, chosen, self.recipe, self.image_hw, rng)
+        chosen = self.views.draw(len(frame.images), rng, most_views)
+        sample = augment(frame, chosen, self.recipe, self.image_hw, rng, self.decoder)
         return _with_or_without_pose(sample, self.pose, f"sample {frame.key} of {self.name}")
 
     def fingerprint(self) -> dict[str, str]:
         """Return that of the source."""
         return dict(self.source.fingerprint())
 
-    def left_out(self) -> tuple[list[str], int]:
-        """Return the source's `faults`, where it keeps such a list (shards that are cut off)."""
-        return [str(fault) for fault in getattr(self.source, "faults", ())], len(self.source)
+    def left_out(self) -> LeftOut:
+        """Return what the source says of it, where it opens although files are damaged."""
+        if not isinstance(self.source, DamagedSource):
+            return LeftOut(len(self.source))
+        faults = tuple(str(fault) for fault in self.source.faults)
+        return LeftOut(len(self.source), self.source.lost_samples, faults)
 
 
 class SyntheticSamples:
@@ -129,16 +149,16 @@ class SyntheticSamples:
             from poem_jax.synthetic.dataset import SyntheticDataset
 
             self._dataset = SyntheticDataset(self._config, self._seed)
-        count = min(len(self._views.draw(self._config.num_views, rng)), most_views)
+        count = len(self._views.draw(self._config.num_views, rng, most_views))
         return _with_or_without_pose(self._dataset.sample(index, count), self._pose, self.name)
 
     def fingerprint(self) -> dict[str, str]:
         """Return nothing: the config says it all."""
         return {}
 
-    def left_out(self) -> tuple[list[str], int]:
+    def left_out(self) -> LeftOut:
         """Return nothing, of a number without end."""
-        return [], 2**62
+        return LeftOut(2**62)
 
 
 class Mixture:
@@ -198,8 +218,10 @@ def open_mixture(
 
     Raises:
         FileNotFoundError: a root, a split's file, or MANO is missing.
+        ModuleNotFoundError: the config's decoder is not installed.
         ValueError: a source is empty or its files are not what they should be.
     """
+    chosen = decoder(config.decoder.value)
     parts: list[Samples] = []
     for part in config.parts:
         if isinstance(part.source, SyntheticSource):
@@ -208,7 +230,7 @@ def open_mixture(
         source = part.source.open()
         if not len(source):
             raise ValueError(f"{source.name} has no sample: {part.source}")
-        parts.append(FrameSamples(source, part.views, config.recipe, image_hw, config.pose))
+        parts.append(FrameSamples(source, part.views, config.recipe, image_hw, config.pose, chosen))
     return Mixture(parts, config.shares, seed)
 
 

@@ -30,7 +30,7 @@ class MixtureStream:
         self._mixture = mixture
         self.report = DataReport(run_dir / REPORT, mixture.names, max_corrupt_share)
         for part, samples in enumerate(mixture.parts):
-            self.report.note_left_out(part, *samples.left_out())
+            self.report.note_left_out(part, samples.left_out())
         self._workers = Workers(mixture, processes) if processes else None
 
     def __enter__(self) -> "MixtureStream":

@@ -2,7 +2,7 @@
 
 import pickle
 import struct
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 UNREADABLE = (
     pickle.PickleError,
@@ -27,7 +27,7 @@ class Failure(NamedTuple):
     error: Exception
 
 
-def send(pipe: BinaryIO, value: Any) -> None:
+def send(pipe: IO[bytes], value: Any) -> None:
     """Write a value and flush.
 
     Raises: OSError: nobody reads any more.
@@ -41,7 +41,7 @@ def send(pipe: BinaryIO, value: Any) -> None:
     pipe.flush()
 
 
-def receive(pipe: BinaryIO) -> Any:
+def receive(pipe: IO[bytes]) -> Any:
     """Read what `send` wrote.
 
     Raises: EOFError: the other side has closed the pipe, or died.
@@ -52,7 +52,7 @@ def receive(pipe: BinaryIO) -> Any:
     return pickle.loads(head, buffers=buffers)
 
 
-def _read(pipe: BinaryIO, length: int) -> bytearray:
+def _read(pipe: IO[bytes], length: int) -> bytearray:
     data = bytearray(length)
     view, done = memoryview(data), 0
     while done < length:

@@ -9,7 +9,7 @@ import pickle
 import signal
 import sys
 import traceback
-from typing import BinaryIO
+from typing import IO
 
 import cv2
 
@@ -33,7 +33,7 @@ ERRORS_OF_SAMPLES = (
 """What the run hears where the batch is asked for; any other error ends the worker, and the run with it."""
 
 
-def serve(requests: BinaryIO, replies: BinaryIO) -> None:
+def serve(requests: IO[bytes], replies: IO[bytes]) -> None:
     """Get a mixture, then answer (position, most_views) with what is drawn there, until the pipe ends."""
     try:
         mixture: Mixture = receive(requests)

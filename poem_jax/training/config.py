@@ -74,7 +74,7 @@ class DataConfig:
     prefetch: int = 3
     """Batches drawn ahead in the background."""
     workers: int = 1
-    """Threads that draw them."""
+    """Threads that draw them; two at least where `mixture.processes` do."""
     mixture: MixtureConfig | None = None
     """Data sets to train on; None = synthetic captures alone. Validation stays with synthetic ones."""
 

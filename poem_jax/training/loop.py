@@ -26,7 +26,7 @@ from poem_jax.training.config import TrainConfig, git_commit
 from poem_jax.training.journal import Journal
 from poem_jax.training.parallel import Step, check_batch_sizes, compile_step, data_mesh, put_batch, replicated
 from poem_jax.training.preflight import check_before_training
-from poem_jax.training.source import BatchAt, open_training_data, training_batches
+from poem_jax.training.source import BatchAt, drawing_threads, open_training_data, training_batches
 from poem_jax.training.state import TrainState, create_state, restart_moments
 from poem_jax.training.step import Metrics
 from poem_jax.training.validation import Validation
@@ -65,11 +65,15 @@ def train(config: TrainConfig, *, batch_at: BatchAt | None = None) -> TrainState
     mixture = open_training_data(config) if batch_at is None else None
     with (
         Checkpoints(run_dir, config) as checkpoints,
-        training_batches(config, mixture) if batch_at is None else nullcontext(batch_at) as draw,
+        nullcontext(batch_at)
+        if batch_at is not None
+        else training_batches(config, mixture, begun=checkpoints.latest_step is not None) as draw,
     ):
         state = initial_state(config, checkpoints, mesh)
         first_step = int(state.step)
-        batches = draw_ahead(draw, first_step, ahead=config.data.prefetch, workers=config.data.workers)
+        batches = draw_ahead(
+            draw, first_step, ahead=config.data.prefetch, workers=drawing_threads(config.data)
+        )
         with Journal(run_dir, config, first_step) as journal, stop_after_the_step() as stopped:
             run = _Run(config, mesh, checkpoints, journal, stopped)
             try:

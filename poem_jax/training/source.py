@@ -42,21 +42,27 @@ def open_training_data(config: TrainConfig) -> Mixture | None:
 
 
 @contextmanager
-def training_batches(config: TrainConfig, mixture: Mixture | None) -> Iterator[BatchAt]:
+def training_batches(config: TrainConfig, mixture: Mixture | None, *, begun: bool) -> Iterator[BatchAt]:
     """Give the function from a step to its batch, for the run in `config.train.out`; workers end here.
 
     Args:
         config: the experiment.
         mixture: its data, opened by `open_training_data`; None = synthetic captures.
+        begun: the run has a checkpoint already.
 
     Raises:
-        ValueError: the run was begun with other files.
+        ValueError: the run was begun with other files, or nobody knows with which.
     """
     if mixture is None or config.data.mixture is None:
         yield synthetic_batches(config.data)
         return
     run_dir, options = Path(config.train.out), config.data.mixture
-    check_files(run_dir / DATA_FILES, mixture.fingerprint(), allow_change=config.train.allow_config_change)
+    check_files(
+        run_dir / DATA_FILES,
+        mixture.fingerprint(),
+        allow_change=config.train.allow_config_change,
+        begun=begun,
+    )
     with MixtureStream(
         mixture,
         processes=options.processes,
@@ -66,11 +72,21 @@ def training_batches(config: TrainConfig, mixture: Mixture | None) -> Iterator[B
         yield mixture_batches(config.data, stream)
 
 
+def drawing_threads(config: DataConfig) -> int:
+    """Return how many batches are drawn at a time.
+
+    Two where processes draw the samples, even if one thread is asked for: the other's samples keep them busy
+    while the last ones of a batch are waited for and stacked.
+    """
+    has_processes = config.mixture is not None and config.mixture.processes > 0
+    return max(config.workers, 2) if has_processes else config.workers
+
+
 def mixture_batches(config: DataConfig, stream: MixtureStream, *, host: int = 0, hosts: int = 1) -> BatchAt:
     """Return the function from a step to this host's part of its batch.
 
-    A batch has as many views as its `BatchShape`; samples have as many as their part of the mixture draws, up
-    to that. Nothing but the step and the seed decides a batch.
+    A batch has as many views as its `BatchShape`; samples have as many as their part of the mixture draws, of
+    at most that. Nothing but the step and the seed decides a batch.
     """
     largest = max(shape.batch_size for shape in config.batches)
 

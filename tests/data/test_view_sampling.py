@@ -10,9 +10,9 @@ from poem_jax.data.view_sampling import AllViews, FixedViews, ReleaseNormalViews
 RANDOM = [UniformViews(), UniformViews(2, 5), ReleaseNormalViews(1, 8), ReleaseNormalViews(2, 3)]
 
 
-def draws(rule, num_views: int, count: int = 6000) -> list[list[int]]:
+def draws(rule, num_views: int, count: int = 6000, most: int | None = None) -> list[list[int]]:
     rng = np.random.default_rng(0)
-    return [rule.draw(num_views, rng).tolist() for _ in range(count)]
+    return [rule.draw(num_views, rng, most).tolist() for _ in range(count)]
 
 
 @pytest.mark.parametrize("rule", [*RANDOM, AllViews(), FixedViews(3)])
@@ -43,6 +43,25 @@ def test_the_papers_numbers_of_views_are_uniform(rule, num_views, counts):
     found = Counter(len(views) for views in draws(rule, num_views))
     assert sorted(found) == list(counts)
     assert all(abs(n - 6000 / len(found)) < 150 for n in found.values())
+
+
+@pytest.mark.parametrize(
+    ("rule", "counts"),
+    [(UniformViews(), [1, 2, 3, 4]), (UniformViews(2, 6), [2, 3, 4]), (UniformViews(6), [4])],
+)
+def test_numbers_of_views_are_as_uniform_where_there_is_room_for_fewer(rule, counts):
+    found = Counter(len(views) for views in draws(rule, 8, most=4))
+    assert sorted(found) == counts
+    assert all(abs(n - 6000 / len(found)) < 150 for n in found.values())
+    assert {view for views in draws(rule, 8, 200, most=4) for view in views} == set(range(8))
+
+
+@pytest.mark.parametrize(
+    "rule", [ReleaseNormalViews(1, 8), ReleaseNormalViews(6, 8), AllViews(), FixedViews(5)]
+)
+def test_other_rules_are_cut_to_the_room_there_is(rule):
+    cut, whole = draws(rule, 6, 200, most=3), draws(rule, 6, 200)
+    assert cut == [views[:3] for views in whole]
 
 
 def test_the_releases_numbers_of_views_are_a_rounded_normal():

@@ -23,6 +23,10 @@ class FakeFrames:
     faults: list[CorruptSampleError] = field(default_factory=list)
 
     @property
+    def lost_samples(self) -> int:
+        return 3 * len(self.faults)
+
+    @property
     def max_views(self) -> int:
         return self.views
 

@@ -10,6 +10,7 @@ import numpy as np
 from poem_jax.batch import MultiViewBatch
 from poem_jax.data.frames import CorruptSampleError
 from poem_jax.geometry.cameras import Cameras
+from poem_jax.mixture.samples import LeftOut
 from poem_jax.mixture.schedule import frame_at
 
 HW = (16, 16)
@@ -55,5 +56,5 @@ class FakeSamples:
     def fingerprint(self) -> dict[str, str]:
         return {f"{self.name}.tar": str(self.length)}
 
-    def left_out(self) -> tuple[list[str], int]:
-        return list(self.faults), self.length
+    def left_out(self) -> LeftOut:
+        return LeftOut(self.length, len(self.faults), self.faults)

@@ -1,6 +1,8 @@
 """Data sets and captures in one mixture; what is corrupt is passed over, and too much of it stops the run."""
 
 import json
+import sys
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -8,17 +10,20 @@ import pytest
 
 from poem_jax.data.augmentation_recipes import NONE
 from poem_jax.data.frames import CorruptSampleError
+from poem_jax.data.sources import captures
 from poem_jax.data.view_sampling import AllViews, UniformViews
-from poem_jax.mixture.config import CapturesSource, MixtureConfig, Part, SyntheticSource
+from poem_jax.mixture import samples
+from poem_jax.mixture.config import CapturesSource, ImageDecoder, MixtureConfig, Part, SyntheticSource
 from poem_jax.mixture.files import check_files
 from poem_jax.mixture.report import DataReport, TooManyCorruptSamples
-from poem_jax.mixture.samples import Drawn, FrameSamples, Mixture, SyntheticSamples, open_mixture
+from poem_jax.mixture.samples import Drawn, FrameSamples, LeftOut, Mixture, SyntheticSamples, open_mixture
 from poem_jax.mixture.stream import MixtureStream, host_rows
 from poem_jax.synthetic.config import SyntheticConfig
 from tests.mixture.fake_frames import FakeFrames
 from tests.mixture.fakes import FakeSamples
 
 HW = (32, 32)
+SHRINKING = replace(NONE, shrinks_while_decoding=True)
 CAPTURES = SyntheticConfig(image_hw=HW, num_views=3, supersample=1, num_backgrounds=1)
 
 
@@ -122,14 +127,16 @@ def test_corrupt_samples_are_named_in_log_and_report_and_stop_past_a_share(tmp_p
     report_of(tmp_path, 50, bad=100)
 
 
-def test_what_a_source_left_out_counts_too(tmp_path, caplog):
+def test_what_a_source_left_out_counts_too(tmp_path):
     report = DataReport(tmp_path / "report.json", ["first"], 0.01)
-    report.note_left_out(0, ["a.tar is cut off"], 500)
-    assert "left out of first: a.tar is cut off" in caplog.text
-    with pytest.raises(TooManyCorruptSamples, match=r"6 of 506 samples of first .*a.tar is cut off"):
-        report.note_left_out(0, ["a.tar is cut off"] * 6, 500)
+    report.note_left_out(0, LeftOut(500, 5, ("a.tar is cut off",)))
+    (entry,) = json.loads(report.file.read_text())
+    assert entry["sources"]["first"]["lost"] == 5
+    assert entry["sources"]["first"]["left_out"] == ["a.tar is cut off"]
+    with pytest.raises(TooManyCorruptSamples, match=r"about 6 of 506 samples of first .*a.tar is cut off"):
+        report.note_left_out(0, LeftOut(500, 6, ("a.tar is cut off",)))
     lost = CorruptSampleError("b.tar", "key", "no label")
-    assert frames(faults=[lost]).left_out() == (["b.tar, sample key: no label"], 5)
+    assert frames(faults=[lost]).left_out() == (5, 3, ("b.tar, sample key: no label",))
 
 
 def test_a_stream_draws_the_same_here_and_writes_its_report(tmp_path):
@@ -159,16 +166,74 @@ def test_hosts_share_a_batch_without_gap_or_overlap():
 def test_changed_files_are_refused_by_name(tmp_path):
     file = tmp_path / "data_files.json"
     then = {"dexycb": {"0.tar": "1 MB", "1.tar": "2 MB"}, "own": {}}
-    check_files(file, then, allow_change=False)
-    check_files(file, then, allow_change=False)
+    check_files(file, then, allow_change=False, begun=False)
+    check_files(file, then, allow_change=False, begun=True)
     now = {"dexycb": {"0.tar": "1 MB", "1.tar": "3 MB", "2.tar": "1 MB"}}
     with pytest.raises(
         ValueError, match=r"dexycb: 1.tar: 2 MB -> 3 MB; dexycb: 2.tar: absent -> 1 MB; own is gone"
     ):
-        check_files(file, now, allow_change=False)
+        check_files(file, now, allow_change=False, begun=True)
     assert json.loads(file.read_text()) == then
-    check_files(file, now, allow_change=True)
+    check_files(file, now, allow_change=True, begun=True)
     assert json.loads(file.read_text()) == now
+
+
+def test_a_lost_list_of_files_is_not_made_up(tmp_path):
+    file, now = tmp_path / "data_files.json", {"dexycb": {"0.tar": "1 MB"}}
+    with pytest.raises(
+        ValueError, match=r"has checkpoints, but data_files.json is gone.*allow-config-change"
+    ):
+        check_files(file, now, allow_change=False, begun=True)
+    assert not file.exists()
+    check_files(file, now, allow_change=True, begun=True)
+    assert json.loads(file.read_text()) == now
+
+
+def test_captures_are_opened_as_the_config_says(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        captures, "Captures", lambda *folders, **options: asked.append((*folders, options)) or FakeFrames()
+    )
+    CapturesSource(("a",), labels=("b.npz",), mano="MANO_RIGHT.pkl", max_reprojection_px=8.0).open()
+    assert asked == [(("a",), {"labels": ("b.npz",), "mano": "MANO_RIGHT.pkl", "max_reprojection_px": 8.0})]
+
+
+@pytest.mark.parametrize("chosen", ImageDecoder)
+def test_the_decoder_of_the_config_decodes(monkeypatch, chosen):
+    if chosen is ImageDecoder.TURBO:
+        pytest.importorskip("simplejpeg")
+    monkeypatch.setattr(CapturesSource, "open", lambda _: FakeFrames())
+    config = MixtureConfig(parts=(Part(CapturesSource(())),), decoder=chosen)
+    mixture = open_mixture(config, synthetic=CAPTURES, seed=0, image_hw=HW)
+    used = []
+    monkeypatch.setattr(samples, "augment", lambda *_: used.append(_[-1].name) or one_sample())
+    mixture.draw(0, 1)
+    assert used == [chosen.value]
+
+
+def one_sample():
+    return FakeSamples("any", 1).sample(0, 1, np.random.default_rng(0))
+
+
+def test_a_decoder_that_is_not_installed_is_named_when_the_mixture_is_opened(monkeypatch):
+    monkeypatch.setitem(sys.modules, "simplejpeg", None)
+    config = MixtureConfig(parts=(Part(SyntheticSource()),), decoder=ImageDecoder.TURBO)
+    with pytest.raises(ModuleNotFoundError, match=r"poem-jax\[turbo\]"):
+        open_mixture(config, synthetic=CAPTURES, seed=0, image_hw=HW)
+
+
+def test_numbers_of_views_are_drawn_for_the_room_a_batch_has(monkeypatch):
+    numbers = Counter()
+    monkeypatch.setattr(
+        samples, "augment", lambda _, views, *__: numbers.update([len(views)]) or one_sample()
+    )
+    frame = FakeFrames(views=8)[0]
+    monkeypatch.setattr(FakeFrames, "__getitem__", lambda *_: frame)
+    part, rng = frames(views=8), np.random.default_rng(0)
+    for _ in range(400):
+        part.sample(0, 4, rng)
+    assert sorted(numbers) == [1, 2, 3, 4]
+    assert all(abs(count - 100) < 35 for count in numbers.values())
 
 
 def test_rules_of_a_mixture(tmp_path):
@@ -181,6 +246,9 @@ def test_rules_of_a_mixture(tmp_path):
         MixtureConfig(parts=(part, replace(part, weight=1e-4)))
     with pytest.raises(ValueError, match=r"must lie in 0..1"):
         MixtureConfig(parts=(part,), max_corrupt_share=2.0)
+    with pytest.raises(ValueError, match=r"needs a decoder that can: `mixture.decoder` TURBO; got OPENCV"):
+        MixtureConfig(parts=(part,), recipe=SHRINKING)
+    MixtureConfig(parts=(part,), recipe=SHRINKING, decoder=ImageDecoder.TURBO)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         open_mixture(
             MixtureConfig(parts=(Part(CapturesSource((str(tmp_path / "nowhere"),))),)),

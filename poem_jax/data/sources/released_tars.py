@@ -16,6 +16,8 @@ LABEL = "label.pyd"
 _IMAGE = r"image_(\d+)\.(?:jpg|jpeg|png)"
 _MAX_LABEL_BYTES = 2**26
 """A label of 8 views has 0.3 MB."""
+_MOST_TOLD = 10
+"""Faults that are logged; `faults` has all."""
 
 _log = logging.getLogger(__name__)
 
@@ -61,8 +63,10 @@ class ReleasedTars:
         self.max_views = self._shards.max_members(_IMAGE)
         if self._convention.pose_lacks_mean and self._mano is None:
             _log.info("%s: poses are left out; they need `mano`, the MANO file's mean pose", self.name)
-        for fault in self.faults:
-            _log.warning("%s", fault)
+        for fault in self.faults[:_MOST_TOLD]:
+            _log.warning("left out of %s: %s", self.name, fault)
+        if len(self.faults) > _MOST_TOLD:
+            _log.warning("left out of %s: %d more", self.name, len(self.faults) - _MOST_TOLD)
         if (problem := count_problem(names, len(self))) is not None:
             if strict_counts:
                 raise ValueError(f"{self.name} {problem}")
@@ -73,6 +77,11 @@ class ReleasedTars:
         """What was left out when the shards were opened: cut or empty shards, keys that come twice, samples
         without a label."""
         return self._shards.faults
+
+    @property
+    def lost_samples(self) -> int:
+        """About how many samples the faults stand for; see `ShardSet`."""
+        return self._shards.lost_samples
 
     def __len__(self) -> int:
         return len(self._shards)
