@@ -12,7 +12,7 @@ PYTEST := $(BIN)/python -m pytest -n 2
 help:
 	@echo "make setup   build .venv from the locked versions"
 	@echo "make demo    reconstruct the bundled 4-camera capture into out/demo"
-	@echo "make test    the default test suite (under 10 minutes on 2 cores)"
+	@echo "make test    the default test suite (a quarter to half an hour on 2 cores)"
 	@echo "make lint    ruff and pyright"
 	@echo "make bench   print the speed tables of benchmarks/"
 

@@ -74,9 +74,10 @@ class StandIn(nnx.Module):
         self.template = Constant(jnp.asarray(template_queries(hand, config.query_order)))
 
     def look(self, views: Array, mode: NormMode) -> Seen:
-        """Average over the pixels."""
-        scale = 255.0 if views.dtype == jnp.uint8 else 1.0
-        return Seen(jnp.mean(jnp.asarray(views, self.template[...].dtype) / scale, (-3, -2)))
+        """Average over the pixels, as sums of whole numbers: exact, in whatever order."""
+        scale = 1.0 if views.dtype == jnp.uint8 else 255.0
+        grey_levels = jnp.round(jnp.asarray(views, self.template[...].dtype) * scale)
+        return Seen(jnp.mean(grey_levels, (-3, -2)) / 255)
 
     def find_hands(
         self,

@@ -56,15 +56,6 @@ RELEASE = replace(PAPER, design=Design.RELEASE)
 METRES = 2e-5
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_fast():
-    """Nearly all that these tests take is compiling."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 @pytest.fixture(params=[PAPER, RELEASE], ids=lambda config: str(config.design))
 def config(request) -> MvpConfig:
     return request.param

@@ -83,15 +83,6 @@ class Model(NamedTuple):
     run: Any
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_fast():
-    """Nearly all that these tests take is compiling."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 @functools.cache
 def model_of(config: PoemV1Config) -> Model:
     """Weights are random, so that zero initial ones hide nothing."""
