@@ -13,6 +13,8 @@ from tests.conftest import SHARED
 
 GOLDEN = SHARED / "reference" / "poem_v1" / "golden_transform_metrics.npz"
 OUT_HW = (256, 256)
+UNREAD = {"full/heatmap", "full/target_joints_uvd"}
+"""What no model of ours reads: maps drawn for a loss that the release leaves out, and scaled depths."""
 pytestmark = pytest.mark.skipif(not GOLDEN.is_file(), reason="needs ../shared")
 
 
@@ -46,6 +48,7 @@ def test_boxes_and_crops_are_the_releases(golden, name):
         index_homography(crops.H_crop_from_image)[0], g["affine"], rtol=1e-6, atol=3e-5
     )
     np.testing.assert_allclose(crops.K[0], span(g["target_intr"]), rtol=1e-6, atol=3e-5)
+    np.testing.assert_allclose(crops.K[0], span(g["affine_postrot"] @ g["K"]), rtol=1e-6, atol=3e-5)
     np.testing.assert_allclose(crops.T_turned_from_cam[0, :3, :3], g["R"], atol=1e-7)
     np.testing.assert_allclose(
         transform_points(crops.T_turned_from_cam[0], g["X"]), g["target_joints_3d"], atol=1e-7
