@@ -125,7 +125,7 @@ def test_workers_of_a_killed_run_end_by_themselves_and_signals_are_the_runs():
         os.kill(pid, signal.SIGINT)
         os.kill(pid, signal.SIGTERM)
     time.sleep(0.2)
-    assert not any(is_gone(pid) for pid in ids)
+    assert not any(is_gone(pid) or _is_zombie(pid) for pid in ids)
     run.kill()
     run.wait()
     run.stdout.close()
