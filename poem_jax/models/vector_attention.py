@@ -30,6 +30,8 @@ _FAR = 1e6
 _TOGETHER = 8
 """Neighbours that are visited at once where their deltas are known, and the largest batch for which that is
 done: programs of inference on a CPU, which it makes faster by a third; others it may slow down."""
+_MOST_STEPS = 8
+"""Of the visits to groups that are written out one after another; the released models have four."""
 
 
 class Deltas(NamedTuple):
@@ -179,11 +181,13 @@ def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]
     # Below all logits, so that the first visit counts whole and what was before it not at all.
     least = jnp.full(logits.shape, jnp.finfo(logits.dtype).min, logits.dtype)
     nothing = _Sums(least, jnp.zeros_like(least), jnp.zeros(values.shape, values.dtype))
-    # In a loop the deltas, which are arguments of the program, would be copied before it starts.
+    # In a loop the deltas, which are arguments of the program, would be copied before it starts; but a program
+    # of hundreds of steps would take an hour, and all memory, to compile.
     few = neighbours.deltas is not None and len(least) <= _TOGETHER
     together = math.gcd(len(neighbours.index), _TOGETHER) if few else 1
     some = jax.tree.map(lambda leaf: leaf.reshape(-1, together, *leaf.shape[1:]), neighbours)
-    sums, _ = jax.lax.scan(lambda sums, some: (add(sums, some), None), nothing, some, unroll=few)
+    written_out = few and len(some.index) <= _MOST_STEPS
+    sums, _ = jax.lax.scan(lambda sums, some: (add(sums, some), None), nothing, some, unroll=written_out)
     return sums.numerator / sums.denominator
 
 

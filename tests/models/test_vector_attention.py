@@ -156,6 +156,22 @@ def test_known_deltas_are_read_in_groups_with_the_same_result_and_gradients(k, b
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), got, expected)
 
 
+def test_hundreds_of_known_neighbours_stay_a_loop():
+    """Written out, a program of so many visits would not finish compiling."""
+    module = VectorAttention(WIDTH, rngs=nnx.Rngs(0))
+
+    points, features = np.random.default_rng(0).normal(size=(2, 200, 3)), np.ones((2, 200, WIDTH))
+
+    def program(k: int) -> str:
+        near = nearest_neighbours(POSITIONS, jnp.asarray(points, jnp.float32), k)
+        known = module.with_deltas(POSITIONS, near)
+        return (
+            jax.jit(module).lower(EMBEDDINGS, POSITIONS, jnp.asarray(features, jnp.float32), known).as_text()
+        )
+
+    assert len(program(199)) < 1.2 * len(program(101))
+
+
 def test_bracketed_attention_maps_before_and_after():
     module = BracketedVectorAttention(WIDTH, rngs=nnx.Rngs(1))
     near = _of(NEIGHBOURS)
