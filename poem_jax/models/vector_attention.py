@@ -181,8 +181,8 @@ def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]
     # Below all logits, so that the first visit counts whole and what was before it not at all.
     least = jnp.full(logits.shape, jnp.finfo(logits.dtype).min, logits.dtype)
     nothing = _Sums(least, jnp.zeros_like(least), jnp.zeros(values.shape, values.dtype))
-    # In a loop the deltas, which are arguments of the program, would be copied before it starts; but a program
-    # of hundreds of steps would take an hour, and all memory, to compile.
+    # In a loop the deltas, which are arguments of the program, would be copied before it starts; but a
+    # program of hundreds of steps would take an hour, and all memory, to compile.
     few = neighbours.deltas is not None and len(least) <= _TOGETHER
     together = math.gcd(len(neighbours.index), _TOGETHER) if few else 1
     some = jax.tree.map(lambda leaf: leaf.reshape(-1, together, *leaf.shape[1:]), neighbours)
