@@ -40,6 +40,36 @@ class DataParallel(Enum):
     JIT = "jit"
 
 
+class Precision(Enum):
+    """What the networks compute in; weights, statistics, geometry and losses stay in float32."""
+
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"
+
+
+class Rematerialise(Enum):
+    """What is computed again in the backward pass, to save memory; the result is the same."""
+
+    NOTHING = "nothing"
+    TRUNK = "trunk"
+    DECODER = "decoder"
+    BOTH = "both"
+
+
+@dataclass(frozen=True)
+class ComputeConfig:
+    """How a step is computed."""
+
+    precision: Precision = Precision.FLOAT32
+    rematerialise: Rematerialise = Rematerialise.NOTHING
+    accumulate: int = 1
+    """Parts in which a device takes its share of a batch, one after the other; the gradient is that of the
+    whole, batch norms see one part at a time."""
+
+    def __post_init__(self) -> None:
+        require(self.accumulate >= 1, f"`compute.accumulate` must be at least 1; got {self.accumulate}")
+
+
 @dataclass(frozen=True)
 class BatchShape:
     """One kind of batch. Every kind compiles its own program."""
@@ -168,6 +198,12 @@ class RunConfig:
     log_every: int = 20
     checkpoint_every: int = 500
     keep_checkpoints: int = 2
+    keep_best: bool = False
+    """Also keep the checkpoint with the least vertex error in validation, the mean over the view counts."""
+    skip_bad_steps: int = 0
+    """Steps whose loss or gradient is not finite that a sitting may leave out; one more stops it."""
+    panel_every: int = 0
+    """Steps between pictures of what the model finds in held-out samples; 0 = never."""
     validate_every: int = 0
     """Steps between validations on held-out samples; 0 = never."""
     validation_samples: int = 32
@@ -202,6 +238,8 @@ _MINIMA = {
     "log_every": 1,
     "checkpoint_every": 1,
     "keep_checkpoints": 1,
+    "skip_bad_steps": 0,
+    "panel_every": 0,
     "validate_every": 0,
     "validation_samples": 1,
     "host_devices": 1,
@@ -223,6 +261,7 @@ class TrainConfig:
     """What is done with every view alone stays as it is, batch norms included; the second stage learns."""
     training_root: TrainingRoot = PAPER_ROOT
     optimizer: OptimizerConfig = OptimizerConfig()
+    compute: ComputeConfig = ComputeConfig()
     train: RunConfig = RunConfig()
 
     def __post_init__(self) -> None:
@@ -302,6 +341,10 @@ BOOKKEEPING = (
     "train.log_every",
     "train.checkpoint_every",
     "train.keep_checkpoints",
+    "train.keep_best",
+    "train.skip_bad_steps",
+    "train.panel_every",
+    "compute.rematerialise",
     "train.validate_every",
     "train.validation_samples",
     "train.validation_views",
@@ -354,6 +397,8 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
 
 
 _LATER = {
+    "compute.precision": "float32",
+    "compute.accumulate": 1,
     "data.mixture": None,
     "frozen_views": False,
     "model.joint_decoder": None,
