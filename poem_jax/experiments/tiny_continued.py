@@ -4,7 +4,7 @@ What:      all of tiny_synthetic from the shipped weights, on other data (seed 3
 Hardware:  2 CPU cores at the lowest priority; the same command uses every GPU or TPU it finds.
 Time:      40,000 steps of 16 captures, a day and a half on two free cores (about 5 captures a second), the
            rate then having run out; the same command goes on where the last one stopped.
-Expected:  see docs/training.md.
+Expected:  see docs/shipped_model.md.
 Command:   poem train tiny_continued
 Then:      poem train tiny_continued --export poem_jax/weights/tiny
 """

@@ -5,8 +5,8 @@ What:      1 to 8 views of 128 x 128, a kind of batch drawn anew every step. The
            losses on every layer; averaged weights are evaluated and shipped.
 Hardware:  a GPU beside many CPU cores that draw the captures; the same command uses what it finds.
 Time:      two days on 2 CPU cores, by its rate there; not run to its end. The shipped weights come from five
-           sittings by scripts around the same modules (docs/training.md).
-Expected:  see docs/training.md (poem eval tiny_synthetic --stages).
+           sittings by scripts around the same modules (docs/shipped_model.md).
+Expected:  see docs/shipped_model.md (poem eval tiny_synthetic --stages).
 Command:   poem train tiny_synthetic
 Then:      poem train tiny_synthetic --export poem_jax/weights/tiny
 

@@ -3,9 +3,9 @@
 What:      sigmoid heat maps of the release's 21 joints, of which only the root is used; the template first;
            three layers, each with the nearest basis points anew. Samples, losses and rates of tiny_synthetic.
 Hardware:  as there.
-Time:      not run to its end here. The figures of docs/training.md are of 2,300 steps beside the shipped
+Time:      not run to its end here. The figures of docs/shipped_model.md are of 2,300 steps beside the shipped
            model; those weights do not ship.
-Expected:  see docs/training.md.
+Expected:  see docs/shipped_model.md.
 Command:   poem train v2_nano_synthetic
 """
 
