@@ -1,0 +1,131 @@
+"""Several hosts that train one model: how they find each other, agree, and end when one of them is lost.
+
+All of it is `jax.distributed`. Where there is one process, nothing here waits or talks to anybody.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+HEARTBEAT_TIMEOUT_S = 30
+"""A host that has not been heard of for so long counts as lost, and ends the others."""
+START_TIMEOUT_S = 300
+"""How long hosts wait for each other at the start."""
+END_TIMEOUT_S = 20
+"""How long a host that ends waits for the others to end too."""
+
+
+class HostLost(RuntimeError):
+    """Another host of the run has ended, so that this one cannot go on."""
+
+
+def start_hosts(coordinator: str | None, count: int | None, index: int | None) -> None:
+    """Make this process one of several that train together; call it before JAX is used.
+
+    Args:
+        coordinator: `HOST:PORT` of the first host, the same on all of them.
+        count: how many processes there are.
+        index: which one this is, from 0. With all three None, JAX asks SLURM, Open MPI or the TPU pod.
+
+    Raises:
+        ValueError: some of the three are given and some are not, they make no sense, or nothing is given and
+            JAX finds no launcher.
+        RuntimeError: the hosts have not found each other, or JAX has been used before.
+    """
+    given = {"--coordinator": coordinator, "--num-hosts": count, "--host-index": index}
+    missing = [name for name, value in given.items() if value is None]
+    if missing and len(missing) < len(given):
+        raise ValueError(f"several hosts need all of {', '.join(given)}; {', '.join(missing)} is missing")
+    if coordinator is not None and count is not None and index is not None:
+        _check(coordinator, count, index)
+    try:
+        jax.distributed.initialize(
+            coordinator,
+            count,
+            index,
+            initialization_timeout=START_TIMEOUT_S,
+            heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT_S,
+            shutdown_timeout_seconds=END_TIMEOUT_S,
+        )
+    except ValueError as error:
+        raise ValueError(
+            f"JAX finds no hosts by itself here ({error}): it asks SLURM, Open MPI and TPU pods. Start the "
+            "processes with one of these, or name them: --coordinator HOST:PORT --num-hosts N --host-index I"
+        ) from error
+    except jax.errors.JaxRuntimeError as error:
+        raise RuntimeError(
+            f"host {index} of {count} has not found the others at {coordinator}: {_first_line(error)}. Start "
+            "all of them within 5 minutes, each with its own --host-index; the port must be free on the "
+            "first host, and open to the others"
+        ) from error
+
+
+def _check(coordinator: str, count: int, index: int) -> None:
+    name, _, port = coordinator.rpartition(":")
+    if not name or not port.isdigit():
+        raise ValueError(f"--coordinator must be HOST:PORT, as in 10.0.0.1:12345; got {coordinator!r}")
+    if not 0 <= index < count:
+        raise ValueError(f"--host-index must be one of 0 to --num-hosts - 1; got {index} of {count}")
+
+
+def is_first_host() -> bool:
+    """Say whether this process writes what is written once: the journal, pictures, reports."""
+    return jax.process_index() == 0
+
+
+def any_host(flag: bool) -> bool:
+    """Say whether `flag` is true on any host. All hosts must ask at the same place, and wait for each other.
+
+    Raises:
+        HostLost: another host has ended.
+    """
+    if jax.process_count() == 1:
+        return flag
+    with names_lost_host():
+        return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+
+
+def wait_for_all(name: str) -> None:
+    """Wait until every host has come to the place with this name.
+
+    Raises:
+        HostLost: another host has ended.
+    """
+    if jax.process_count() == 1:
+        return
+    with names_lost_host():
+        multihost_utils.sync_global_devices(name)
+
+
+@contextmanager
+def names_lost_host() -> Iterator[None]:
+    """Turn what the collectives say when a host has gone into a `HostLost`; leave other errors as they are."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1 or not any(word in str(error) for word in _LOST):
+            raise
+        raise HostLost(
+            f"host {jax.process_index()} of {jax.process_count()} cannot go on: another host has ended or "
+            f"cannot be reached ({_first_line(error)}). Its own output says why; start all hosts again, and "
+            "training goes on from the newest checkpoint"
+        ) from error
+
+
+_LOST = (
+    "Gloo",
+    "Connection reset",
+    "Connection closed",
+    "heartbeat",
+    "UNAVAILABLE",
+    "DEADLINE_EXCEEDED",
+    "NCCL",
+)
+"""Words in the errors of collectives whose other side is gone."""
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0][:300]
