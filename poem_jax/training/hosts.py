@@ -102,7 +102,7 @@ def wait_for_all(name: str) -> None:
 
 @contextmanager
 def names_lost_host() -> Iterator[None]:
-    """Turn what the collectives say when a host has gone into a `HostLost`; leave other errors as they are."""
+    """Turn what the collectives say when a host has gone into a `HostLost`; other errors stay as they are."""
     try:
         yield
     except jax.errors.JaxRuntimeError as error:

@@ -1,10 +1,16 @@
-"""The train step on several devices, with the result of one: `shard_map`, `jit` over a mesh, or `pmap`."""
+"""The train step on several devices, with the result of one: `shard_map`, `jit` over a mesh, or `pmap`.
 
+The devices may belong to several hosts. Each host then gives its rows of a batch, and all devices together
+hold the batch that a single host would have drawn, in the same order.
+"""
+
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -19,9 +25,14 @@ Step = Callable[[TrainState, MultiViewBatch, jax.Array], tuple[TrainState, Metri
 
 
 def data_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Lay all devices along one axis, over which batches are split."""
+    """Lay all devices along one axis, over which batches are split, those of a host beside each other."""
     devices = jax.devices() if devices is None else list(devices)
-    return jax.make_mesh((len(devices),), (AXIS,), axis_types=(jax.sharding.AxisType.Auto,), devices=devices)
+    auto = (jax.sharding.AxisType.Auto,)
+    if jax.process_count() == 1:
+        return jax.make_mesh((len(devices),), (AXIS,), axis_types=auto, devices=devices)
+    # `make_mesh` may follow the wires of a TPU instead, and mix the hosts' rows.
+    in_order = sorted(devices, key=lambda device: (device.process_index, device.id))
+    return Mesh(np.array(in_order), (AXIS,), axis_types=auto)
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
@@ -35,32 +46,48 @@ def split_batch(mesh: Mesh) -> NamedSharding:
 
 
 def check_batch_sizes(config: TrainConfig, mesh: Mesh) -> None:
-    """Insist that every batch can be split evenly over the devices of this process.
+    """Insist that every batch can be split evenly over the devices of all hosts.
 
     Raises:
-        ValueError: it cannot, or there are several processes, or the model's samples depend on each other.
+        ValueError: it cannot, or hosts have different numbers of devices, or the model's samples depend on
+            each other.
     """
-    if jax.process_count() > 1:
-        raise ValueError(
-            f"training runs in one process on the devices of one machine; got {jax.process_count()} processes"
-        )
     if config.model.couples_samples and mesh.size > 1:
         raise ValueError(
             f"a batch of this {type(config.model).__name__} must stay on one device, for its samples depend "
             f"on each other; got {mesh.size} devices. Show JAX one (CUDA_VISIBLE_DEVICES, "
             "`train.host_devices`)"
         )
+    of_hosts = Counter(device.process_index for device in mesh.devices.flat)
+    if len(set(of_hosts.values())) > 1:
+        counts = [number for _, number in sorted(of_hosts.items())]
+        raise ValueError(
+            f"every host must have the same number of devices; got {counts}. "
+            "Show JAX fewer on some (CUDA_VISIBLE_DEVICES, `train.host_devices`), or leave a host out"
+        )
     sizes = [shape.batch_size for shape in config.data.batches]
     if any(size % mesh.size for size in sizes):
+        hosts = f" of all {len(of_hosts)} hosts" if len(of_hosts) > 1 else ""
         raise ValueError(
-            f"every `batch_size` must be a multiple of the number of devices, {mesh.size}; got {sizes}. "
+            f"every `batch_size` must be a multiple of the number of devices{hosts}, {mesh.size}; "
+            f"got {sizes}. "
             "Change `data.batches`, or show JAX fewer devices (CUDA_VISIBLE_DEVICES, `train.host_devices`)"
         )
 
 
 def put_batch(batch: MultiViewBatch, mesh: Mesh) -> MultiViewBatch:
-    """Move a batch onto the devices, each its part."""
-    return jax.device_put(batch, split_batch(mesh))
+    """Move a batch, or this host's rows of it, onto the devices, each its part."""
+    sharding = split_batch(mesh)
+    if jax.process_count() == 1:
+        return jax.device_put(batch, sharding)
+    return jax.tree.map(lambda rows: jax.make_array_from_process_local_data(sharding, rows), batch)
+
+
+def put_everywhere(tree: PyTree, mesh: Mesh) -> PyTree:
+    """Put what every host has alike, such as a fresh state or a key, on every device."""
+    if jax.process_count() == 1:
+        return jax.device_put(tree, replicated(mesh))
+    return jax.jit(lambda same: same, out_shardings=replicated(mesh))(tree)
 
 
 def compile_step(config: TrainConfig, mesh: Mesh, *, first_stage: bool = False) -> Step:
