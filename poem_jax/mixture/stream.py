@@ -69,7 +69,7 @@ class MixtureStream:
 def host_rows(step: int, size: int, stride: int, *, host: int = 0, hosts: int = 1) -> list[int]:
     """Return the positions of a step's samples in the mixture's stream that this host draws.
 
-    Host h of H has those that leave the remainder h; all hosts together have the batch of a single one.
+    Host h of H has the h-th of H equal blocks; one behind the other they are the batch of a single host.
 
     Args:
         step: the step.
@@ -78,11 +78,12 @@ def host_rows(step: int, size: int, stride: int, *, host: int = 0, hosts: int = 
         host, hosts: this one, of how many.
 
     Raises:
-        ValueError: sizes that `hosts` does not divide: hosts would have parts of unequal size.
+        ValueError: a size that `hosts` does not divide: hosts would have parts of unequal size.
     """
-    if size % hosts or stride % hosts or not 0 <= host < hosts or size > stride:
+    if size % hosts or not 0 <= host < hosts or size > stride:
         raise ValueError(
-            f"batches of {size} (the largest {stride}) samples cannot be shared evenly; `host` {host} must "
-            f"be one of {hosts} that divide both"
+            f"a batch of {size} samples (the largest: {stride}) cannot be shared evenly; `host` {host} must "
+            f"be one of {hosts} that divide it"
         )
-    return [position for position in range(step * stride, step * stride + size) if position % hosts == host]
+    first = step * stride + host * (size // hosts)
+    return list(range(first, first + size // hosts))

@@ -1,9 +1,14 @@
-"""Training batches: a pure function of the step, from synthetic captures or a mixture of data sets."""
+"""Training batches: a pure function of the step, from synthetic captures or a mixture of data sets.
+
+A step's samples have numbers that no host and no device enters into. Of several hosts each draws one block of
+them, so that all together have the batch of a single one, in its order.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from poem_jax.batch import MultiViewBatch
@@ -13,6 +18,7 @@ from poem_jax.mixture.samples import Mixture, open_mixture
 from poem_jax.mixture.stream import MixtureStream, host_rows
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.training.config import BatchShape, DataConfig, TrainConfig
+from poem_jax.training.hosts import is_first_host, wait_for_all
 
 BatchAt = Callable[[int], MultiViewBatch]
 
@@ -43,7 +49,8 @@ def open_training_data(config: TrainConfig) -> Mixture | None:
 
 @contextmanager
 def training_batches(config: TrainConfig, mixture: Mixture | None, *, begun: bool) -> Iterator[BatchAt]:
-    """Give the function from a step to its batch, for the run in `config.train.out`; workers end here.
+    """Give the function from a step to this host's rows of its batch, for the run in `config.train.out`;
+    workers end here.
 
     Args:
         config: the experiment.
@@ -51,25 +58,33 @@ def training_batches(config: TrainConfig, mixture: Mixture | None, *, begun: boo
         begun: the run has a checkpoint already.
 
     Raises:
-        ValueError: the run was begun with other files, or nobody knows with which.
+        ValueError: the run was begun with other files, or nobody knows with which; or this host's files are
+            not those of the first one.
     """
+    host, hosts = jax.process_index(), jax.process_count()
     if mixture is None or config.data.mixture is None:
-        yield synthetic_batches(config.data)
+        yield synthetic_batches(config.data, host=host, hosts=hosts)
         return
     run_dir, options = Path(config.train.out), config.data.mixture
-    check_files(
-        run_dir / DATA_FILES,
-        mixture.fingerprint(),
-        allow_change=config.train.allow_config_change,
-        begun=begun,
-    )
+    _check_files(config, mixture, begun=begun)
     with MixtureStream(
         mixture,
         processes=options.processes,
-        run_dir=run_dir,
+        # Of what the other hosts could not use, each has a report of its own.
+        run_dir=run_dir if is_first_host() else run_dir / f"host_{host}",
         max_corrupt_share=options.max_corrupt_share,
     ) as stream:
-        yield mixture_batches(config.data, stream)
+        yield mixture_batches(config.data, stream, host=host, hosts=hosts)
+
+
+def _check_files(config: TrainConfig, mixture: Mixture, *, begun: bool) -> None:
+    """Compare the data with those that the run began with; the other hosts' with the first one's."""
+    file, allow_change = Path(config.train.out) / DATA_FILES, config.train.allow_config_change
+    if is_first_host():
+        check_files(file, mixture.fingerprint(), allow_change=allow_change, begun=begun)
+    wait_for_all("the first host's data are checked")
+    if not is_first_host():
+        check_files(file, mixture.fingerprint(), allow_change=False, begun=True)
 
 
 def drawing_threads(config: DataConfig) -> int:
@@ -98,8 +113,8 @@ def mixture_batches(config: DataConfig, stream: MixtureStream, *, host: int = 0,
     return batch_at
 
 
-def synthetic_batches(config: DataConfig) -> BatchAt:
-    """Return the function from a step to its batch.
+def synthetic_batches(config: DataConfig, *, host: int = 0, hosts: int = 1) -> BatchAt:
+    """Return the function from a step to this host's part of its batch.
 
     Nothing but the step and the seed decides a batch, so that a resumed run sees exactly the samples that it
     would have seen. No sample index comes twice.
@@ -113,9 +128,8 @@ def synthetic_batches(config: DataConfig) -> BatchAt:
         counts = rng.integers(
             shape.min_views or shape.num_views, shape.num_views, shape.batch_size, endpoint=True
         )
-        samples = [
-            dataset.sample(step * largest + row, num_views=int(count)) for row, count in enumerate(counts)
-        ]
+        rows = host_rows(step, shape.batch_size, largest, host=host, hosts=hosts)
+        samples = [dataset.sample(row, num_views=int(counts[row - step * largest])) for row in rows]
         return collate(samples, shape.num_views)
 
     return batch_at
