@@ -122,6 +122,16 @@ class DamagedSource(FrameSource, Protocol):
         ...
 
 
+@runtime_checkable
+class TakesSource(FrameSource, Protocol):
+    """A source that tells which of its samples were taken one after another."""
+
+    @property
+    def takes(self) -> Int[Array, "sample 2"]:
+        """Number of the take (capture, shard) of each sample, and of the instant within it, in order."""
+        ...
+
+
 def check_frame(frame: MultiViewFrame, path: str | Path) -> MultiViewFrame:
     """Return the frame if it can be true, and round nothing.
 

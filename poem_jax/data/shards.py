@@ -18,6 +18,7 @@ import numpy as np
 
 from poem_jax.data.frames import CorruptSampleError
 from poem_jax.data.tar_index import shown, tar_index
+from poem_jax.typing import Array, Int
 
 _BRACES = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _MAX_SHARDS = 10**5
@@ -87,6 +88,11 @@ class ShardSet:
                 behind = (path.stat().st_size - index.end) / sample_bytes if samples else 0.0
                 lost += max(usual - len(index), round(behind), 1) - 1
         return lost
+
+    @property
+    def shards_of_samples(self) -> Int[Array, " sample"]:
+        """Number of the shard that each sample lies in."""
+        return np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows])
 
     def locate(self, index: int) -> tuple[Path, str]:
         """Return the shard and the key of a sample.

@@ -202,8 +202,16 @@ class Part:
     """How often it is drawn, relative to the others."""
     views: ViewSampling = UniformViews()
     """How many of a frame's views a sample has, and in which order; at most the `num_views` of its batch."""
+    held_out: float = 0.0
+    """Share of the frames that is validated on and never trained on: the last ones of every capture or shard,
+    or of the whole where the source does not tell such apart."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.held_out < 1 or (self.held_out and isinstance(self.source, SyntheticSource)):
+            raise ValueError(
+                "`held_out` must lie in 0..1, 1 excluded, and be 0 for synthetic captures, which validation "
+                f"draws anew; got {self}"
+            )
         if not self.weight > 0:
             raise ValueError(f"`weight` must be positive (leave the part out instead); got {self}")
 

@@ -1,5 +1,6 @@
 """Sample n of a mixture: a pure function of (config, seed, n), whoever draws it and when."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
@@ -10,7 +11,9 @@ from poem_jax.data.augmentation import augment
 from poem_jax.data.augmentation_recipes import Recipe
 from poem_jax.data.frames import CorruptSampleError, DamagedSource, FrameSource
 from poem_jax.data.pictures import Decoder, decoder
+from poem_jax.data.view_sampling import AllViews
 from poem_jax.mixture.config import MixtureConfig, SyntheticSource, ViewSampling
+from poem_jax.mixture.held_out import hold_out
 from poem_jax.mixture.schedule import Schedule, frame_at
 from poem_jax.synthetic.config import SyntheticConfig
 
@@ -164,9 +167,26 @@ class SyntheticSamples:
 class Mixture:
     """All parts, opened. Can be pickled: worker processes get it whole."""
 
-    def __init__(self, parts: list[Samples], shares: tuple[float, ...], seed: int) -> None:
+    def __init__(
+        self,
+        parts: list[Samples],
+        shares: tuple[float, ...],
+        seed: int,
+        held_out: Mapping[int, FrameSamples] | None = None,
+    ) -> None:
+        """Take the parts, and by a part's number the frames that it holds out."""
         self.parts, self.seed = parts, seed
-        self._schedule = Schedule(shares, seed)
+        self._schedule, self._held_out = Schedule(shares, seed), held_out or {}
+
+    def __getstate__(self) -> dict:
+        # Workers draw what is trained on.
+        return {**self.__dict__, "_held_out": {}}
+
+    @property
+    def held_out(self) -> dict[str, FrameSamples]:
+        """What is validated on, by the part's name: all views, nothing augmented."""
+        names = self.names
+        return {names[part]: frames for part, frames in self._held_out.items()}
 
     @property
     def names(self) -> list[str]:
@@ -223,15 +243,20 @@ def open_mixture(
     """
     chosen = decoder(config.decoder.value)
     parts: list[Samples] = []
-    for part in config.parts:
+    held_out: dict[int, FrameSamples] = {}
+    for number, part in enumerate(config.parts):
         if isinstance(part.source, SyntheticSource):
             parts.append(SyntheticSamples(synthetic, seed, part.views, config.pose))
             continue
         source = part.source.open()
         if not len(source):
             raise ValueError(f"{source.name} has no sample: {part.source}")
+        if part.held_out:
+            source, rest = hold_out(source, part.held_out)
+            plain = config.recipe.without_jitter()
+            held_out[number] = FrameSamples(rest, AllViews(), plain, image_hw, config.pose, chosen)
         parts.append(FrameSamples(source, part.views, config.recipe, image_hw, config.pose, chosen))
-    return Mixture(parts, config.shares, seed)
+    return Mixture(parts, config.shares, seed, held_out)
 
 
 def _with_or_without_pose(sample: MultiViewBatch, pose: bool, name: str) -> MultiViewBatch:

@@ -8,6 +8,7 @@ import json
 import subprocess
 from dataclasses import dataclass, field
 from enum import Enum
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,8 @@ class DataConfig:
     workers: int = 1
     """Threads that draw them; two at least where `mixture.processes` do."""
     mixture: MixtureConfig | None = None
-    """Data sets to train on; None = synthetic captures alone. Validation stays with synthetic ones."""
+    """Data sets to train on; None = synthetic captures alone. Validation is on synthetic ones and on what
+    parts hold out."""
 
     def __post_init__(self) -> None:
         require(
@@ -387,7 +389,7 @@ def config_json(config: TrainConfig) -> str:
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Describe the fields in which two flattened configs differ, bookkeeping aside."""
     ours = _learned(new)
-    theirs = {key: value for key, value in _LATER.items() if key in ours} | _learned(old)
+    theirs = _as_before(ours) | _learned(old)
     missing = "absent"
     return [
         f"{key}: {theirs.get(key, missing)} -> {ours.get(key, missing)}"
@@ -400,6 +402,7 @@ _LATER = {
     "compute.precision": "float32",
     "compute.accumulate": 1,
     "data.mixture": None,
+    "data.mixture.parts.*.held_out": 0.0,
     "frozen_views": False,
     "model.joint_decoder": None,
     "model.backbone.frozen_norms": "none",
@@ -408,7 +411,11 @@ _LATER = {
     "loss.vertex_reprojection": 0.0,
     "training_root.max_error_m": 0.1,
 }
-"""Fields that runs of earlier versions do not name, and what they did."""
+"""Fields that runs of earlier versions do not name (`*`: any number), and what they did."""
+
+
+def _as_before(ours: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for name, value in _LATER.items() for key in ours if fnmatchcase(key, name)}
 
 
 def _learned(flat: dict[str, Any]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from poem_jax.data.sources.raw_sets import identify, identify_list, read_image
 from poem_jax.geometry.cameras import project_cam
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_SHAPES, NUM_SKELETON_JOINTS
-from poem_jax.typing import Array, Bool, Float
+from poem_jax.typing import Array, Bool, Float, Int
 
 MIN_JOINTS_SHOWN = 11
 """Of 21, for a view to be used: more than half."""
@@ -100,6 +100,11 @@ class Captures:
 
     def __len__(self) -> int:
         return len(self._places)
+
+    @property
+    def takes(self) -> Int[Array, "sample 2"]:
+        """Return capture and frame of each sample; see `TakesSource`."""
+        return np.array([(place.capture, place.frame) for place in self._places])
 
     def __getitem__(self, index: int) -> MultiViewFrame:
         """Return the hand of one frame; see `FrameSource`."""

@@ -5,12 +5,15 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from poem_jax.data.frames import CorruptSampleError, EncodedImage, MultiViewFrame
 from poem_jax.data.released_sets import count_problem, of_split, shard_name
 from poem_jax.data.shards import ShardSet, expand_shards
 from poem_jax.data.sources.hand_in_views import ManoFile
 from poem_jax.data.tar_labels import convention_of, frame_from_label
 from poem_jax.io.safe_pickle import loads_arrays_pickle
+from poem_jax.typing import Array, Int
 
 LABEL = "label.pyd"
 _IMAGE = r"image_(\d+)\.(?:jpg|jpeg|png)"
@@ -82,6 +85,11 @@ class ReleasedTars:
     def lost_samples(self) -> int:
         """About how many samples the faults stand for; see `ShardSet`."""
         return self._shards.lost_samples
+
+    @property
+    def takes(self) -> Int[Array, "sample 2"]:
+        """Return shard and place of each sample; see `TakesSource`."""
+        return np.stack([self._shards.shards_of_samples, np.arange(len(self))], -1)
 
     def __len__(self) -> int:
         return len(self._shards)

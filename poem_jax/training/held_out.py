@@ -1,0 +1,80 @@
+"""The held-out frames of a run's mixture, as batches for its validation."""
+
+import logging
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from poem_jax.batch import MultiViewBatch
+from poem_jax.data.batching import collate
+from poem_jax.data.frames import CorruptSampleError
+from poem_jax.mixture.samples import FrameSamples, Mixture
+from poem_jax.training.config import TrainConfig
+from poem_jax.training.source import open_training_data
+
+_log = logging.getLogger(__name__)
+
+
+def held_out_batches(
+    config: TrainConfig, mixture: Mixture | None = None, *, multiple_of: int = 1
+) -> dict[str, list[MultiViewBatch]]:
+    """Read the held-out frames of every part of the mixture that has some, up to `train.validation_samples`
+    evenly spread over them; the same ones every time, all views, nothing augmented.
+
+    Args:
+        config: the experiment.
+        mixture: its data, where they are open already.
+        multiple_of: what sizes of batches must be a multiple of: the number of devices.
+
+    Returns:
+        Batches by the part's name, blanks as underscores; the last one is filled up with samples that its
+        `sample_mask` leaves out. Nothing where no part holds frames out.
+
+    Raises:
+        ValueError: a part's held-out frames have one view each, in which the model cannot place a hand.
+    """
+    parts = () if config.data.mixture is None else config.data.mixture.parts
+    if not any(part.held_out for part in parts):
+        return {}
+    mixture = open_training_data(config) if mixture is None else mixture
+    assert mixture is not None
+    largest = max(shape.batch_size for shape in config.data.batches)
+    batches = {}
+    for name, frames in mixture.held_out.items():
+        samples = list(_read(config, name, frames))
+        size = min(largest, -(-len(samples) // multiple_of) * multiple_of)
+        chunks = [samples[i : i + size] for i in range(0, len(samples), size)]
+        batches[re.sub(r"\W+", "_", name)] = [_filled(config, chunk, size) for chunk in chunks]
+    return batches
+
+
+def _read(config: TrainConfig, name: str, frames: FrameSamples) -> Iterator[MultiViewBatch]:
+    """Yield samples; those that cannot be used are named and left out."""
+    count = min(len(frames.source), config.train.validation_samples)
+    least = 2 if config.model.triangulates else 1
+    found = 0
+    for index in np.linspace(0, len(frames.source) - 1, count).round().astype(int):
+        try:
+            # Nothing of the sample is left to chance; augmenting draws all the same.
+            sample = frames.sample(int(index), _most_views(config), np.random.default_rng(0))
+        except CorruptSampleError as error:
+            _log.warning("held-out sample of %s passed over: %s", name, error)
+            continue
+        if len(sample.views) >= least:
+            found += 1
+            yield sample
+    if not found:
+        raise ValueError(
+            f"none of {count} held-out frames of {name} can be used; a {type(config.model).__name__} needs "
+            f"{least} views of a hand. Leave that part's `held_out` at 0"
+        )
+
+
+def _filled(config: TrainConfig, samples: list[MultiViewBatch], size: int) -> MultiViewBatch:
+    batch = collate([*samples, *samples[-1:] * (size - len(samples))], _most_views(config))
+    return batch._replace(sample_mask=np.arange(size) < len(samples))
+
+
+def _most_views(config: TrainConfig) -> int:
+    return max(shape.num_views for shape in config.data.batches)
