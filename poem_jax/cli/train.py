@@ -1,15 +1,17 @@
 """`poem train`."""
 
 import os
+import tempfile
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from poem_jax.cli.messages import say, tells_what_is_left
-from poem_jax.cli.options import Experiment, Flag, OptionalFolder
+from poem_jax.cli.options import Experiment, Flag, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.training.config import TrainConfig
@@ -24,28 +26,85 @@ class Train:
     """
 
     experiment: Experiment
-    """An experiment of the package, such as tiny_synthetic, or a Python file that defines `config`."""
+    """An experiment of the package, such as tiny_synthetic, or a Python file that defines `config`; of a file
+    with several, NAME:WHICH."""
+    init: Annotated[str | None, tyro.conf.arg(metavar="CKPT")] = None
+    """Fine-tune the model in this folder, or the one that comes with the package: shipped. The experiment's
+    model becomes the folder's."""
+    data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...")] = ()
+    """Train on these in place of the experiment's data sets: captures with labels (poem fit makes them), or
+    whatever else `poem inspect` knows."""
+    mano: OptionalFile = None
+    """MANO_RIGHT.pkl, for --data that need it."""
     export: OptionalFolder = None
     """Write the averaged weights of the newest checkpoint there as a model, and train nothing."""
+    smoke: Flag = False
+    """Try the experiment: two steps of a tiny model on stand-ins of its data, in a folder that is removed."""
+    hosts: Annotated[Literal["auto"] | None, tyro.conf.arg(metavar="auto")] = None
+    """auto: one of several processes that SLURM, Open MPI or a TPU pod has started."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """One of several processes: where the first one listens."""
+    num_hosts: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """How many processes there are."""
+    host_index: Annotated[int | None, tyro.conf.arg(metavar="I")] = None
+    """Which one this is, from 0."""
     debug: Flag = False
     """Show the full traceback of an error."""
     overrides: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
 
     def run(self) -> None:
         """Train, or export, and print how far it is and where the results are."""
+        if self.smoke and self.export is not None:
+            raise ValueError("--smoke keeps nothing that --export could write; give one of the two")
+        with tempfile.TemporaryDirectory(prefix="poem_smoke_") if self.smoke else nullcontext() as folder:
+            config = self._config(None if folder is None else Path(folder))
+            choose_devices(config)
+            self._join_hosts()
+            if self.export is not None:
+                self._export(config)
+                return
+            self._train(config)
+
+    def _config(self, smoke_folder: Path | None) -> "TrainConfig":
+        """Open the experiment and apply the options, each upon what the one before made of it."""
         from poem_jax.experiments import open_experiment
 
-        config = override(open_experiment(self.experiment), self.overrides)
-        choose_devices(config)
-        if self.export is not None:
-            self._export(config)
+        config = open_experiment(self.experiment)
+        if self.init is not None or self.data:
+            from poem_jax.training.finetune import start_from, train_on
+
+            config = config if self.init is None else start_from(config, self.init)
+            config = train_on(config, self.data, mano=self.mano) if self.data else config
+        elif self.mano is not None:
+            raise ValueError("--mano belongs to --data; an experiment names its own MANO file")
+        if smoke_folder is not None:
+            from poem_jax.experiments.smoke import smoke
+
+            say(f"trying {config.name} in {smoke_folder}")
+            config = smoke(config, smoke_folder)
+        return override(config, self.overrides)
+
+    def _join_hosts(self) -> None:
+        named = (self.coordinator, self.num_hosts, self.host_index)
+        if self.hosts is None and named == (None, None, None):
             return
+        from poem_jax.training.hosts import start_hosts
+
+        if self.hosts is not None and named != (None, None, None):
+            raise ValueError(
+                "--hosts auto asks the launcher what --coordinator, --num-hosts and --host-index say; give "
+                "one or the other"
+            )
+        start_hosts(*named)
+
+    def _train(self, config: "TrainConfig") -> None:
         from poem_jax.training.loop import train
 
         out, steps = config.train.out, config.train.steps
         with tells_what_is_left(Path(out)):
             state = train(config)
-        print(f"step {int(state.step)} of {steps}; checkpoints and metrics are in {out}")
+        where = "nothing is kept" if self.smoke else f"checkpoints and metrics are in {out}"
+        print(f"step {int(state.step)} of {steps}; {where}")
 
     def _export(self, config: "TrainConfig") -> None:
         from poem_jax.io.writable import check_folder_is_writable

@@ -279,7 +279,7 @@ class TrainConfig:
         )
         mixture = self.data.mixture
         require(
-            mixture is None or not _predicts_parameters(self.model) or mixture.pose,
+            mixture is None or not predicts_parameters(self.model) or mixture.pose,
             "a parametric model learns pose and shape; turn `data.mixture.pose` on",
         )
         require(
@@ -332,7 +332,8 @@ class TrainConfig:
         )
 
 
-def _predicts_parameters(model: ModelConfig) -> bool:
+def predicts_parameters(model: ModelConfig) -> bool:
+    """Say whether pose and shape are what the model learns, and its samples must have."""
     return isinstance(model, Config) and model.decoder.output is DecoderOutput.HAND_PARAMETERS
 
 

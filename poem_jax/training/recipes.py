@@ -21,9 +21,14 @@ one view, which triangulates none, takes it in v1, too.
 """
 
 from dataclasses import dataclass, replace
+from functools import singledispatch
 from typing import Any
 
 from poem_jax import losses
+from poem_jax.models.config import Config, Design, ModelConfig, ResNetConfig
+from poem_jax.models.mesh_transformer_config import CanonicalFusion, MeshTransformerConfig
+from poem_jax.models.mvp_config import MvpConfig
+from poem_jax.models.poem_v1_config import OneStageConfig, PoemV1Config
 from poem_jax.training.config import (
     PAPER_ROOT,
     RELEASE_ROOT,
@@ -33,6 +38,7 @@ from poem_jax.training.config import (
     Schedule,
     TrainConfig,
     TrainingRoot,
+    predicts_parameters,
 )
 
 
@@ -98,15 +104,66 @@ V1_RECIPES = (
 )
 """POEM v1 (also its ablations of two stages), and the baselines. The paper does not mention clipping; its
 recipes clip as `paper` does."""
-RECIPES = {recipe.name: recipe for recipe in (PAPER_RECIPE, RELEASE_RECIPE, RELEASE_MANO_RECIPE, *V1_RECIPES)}
+SYNTHETIC_RECIPE = Recipe(
+    "synthetic",
+    losses.SYNTHETIC,
+    _OWN_ROOT,
+    OptimizerConfig(learning_rate=1e-3, warmup_steps=200, final_ratio=0.005, ema_decay=0.998),
+)
+"""Of our own models on the small trunk, `tiny` and `v2-nano`."""
+RECIPES = {
+    recipe.name: recipe
+    for recipe in (PAPER_RECIPE, RELEASE_RECIPE, RELEASE_MANO_RECIPE, SYNTHETIC_RECIPE, *V1_RECIPES)
+}
+
+
+def recipe_of(model: ModelConfig) -> Recipe:
+    """Return the recipe that a model is trained by, as the table of `docs/models.md` has it."""
+    return RECIPES[_recipe_name(model)]
+
+
+@singledispatch
+def _recipe_name(model: ModelConfig) -> str:
+    raise NotImplementedError(f"say here which recipe a {type(model).__name__} is trained by")
+
+
+@_recipe_name.register
+def _(model: Config) -> str:
+    if isinstance(model.backbone, ResNetConfig):
+        return "synthetic"
+    if model.decoder.layer is Design.PAPER:
+        return "paper"
+    return "release-mano" if predicts_parameters(model) else "release"
+
+
+@_recipe_name.register
+def _(model: PoemV1Config) -> str:
+    if isinstance(model.first_stage, OneStageConfig):
+        return "v1-1stage"
+    return _of_design("v1", model.design)
+
+
+@_recipe_name.register
+def _(model: MeshTransformerConfig) -> str:
+    own_points = isinstance(model.fusion, CanonicalFusion)
+    return _of_design("ftl-meshtr" if own_points else "pe-meshtr", model.design)
+
+
+@_recipe_name.register
+def _(model: MvpConfig) -> str:
+    return _of_design("mvp", model.design)
+
+
+def _of_design(name: str, design: Design) -> str:
+    return name if design is Design.PAPER else f"{name}-release"
 
 
 def experiment(recipe: str, **rest: Any) -> TrainConfig:
     """Make an experiment that follows a recipe.
 
     Args:
-        recipe: `"paper"`, `"release"`, `"release-mano"` for the parametric model, or one of POEM v1 and the
-            baselines, such as `"v1"` or `"mvp-release"`.
+        recipe: `"paper"`, `"release"`, `"release-mano"` for the parametric model, `"synthetic"` for `tiny`
+            and `v2-nano`, or one of POEM v1 and the baselines, such as `"v1"` or `"mvp-release"`.
         rest: the other fields of `TrainConfig`; one that the recipe sets may be given to replace it.
 
     Raises:
