@@ -3,7 +3,6 @@
 import os
 import tempfile
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -54,18 +53,18 @@ class Train:
 
     def run(self) -> None:
         """Train, or export, and print how far it is and where the results are."""
-        if self.smoke and self.export is not None:
-            raise ValueError("--smoke keeps nothing that --export could write; give one of the two")
-        with tempfile.TemporaryDirectory(prefix="poem_smoke_") if self.smoke else nullcontext() as folder:
-            config = self._config(None if folder is None else Path(folder))
-            choose_devices(config)
-            self._join_hosts()
-            if self.export is not None:
-                self._export(config)
-                return
-            self._train(config)
+        config = self._config()
+        choose_devices(config)
+        if self.smoke:
+            self._try(config)
+            return
+        self._join_hosts()
+        if self.export is not None:
+            self._export(config)
+            return
+        self._train(config)
 
-    def _config(self, smoke_folder: Path | None) -> "TrainConfig":
+    def _config(self) -> "TrainConfig":
         """Open the experiment and apply the options, each upon what the one before made of it."""
         from poem_jax.experiments import open_experiment
 
@@ -77,17 +76,28 @@ class Train:
             config = train_on(config, self.data, mano=self.mano) if self.data else config
         elif self.mano is not None:
             raise ValueError("--mano belongs to --data; an experiment names its own MANO file")
-        if smoke_folder is not None:
-            from poem_jax.experiments.smoke import smoke
-
-            say(f"trying {config.name} in {smoke_folder}")
-            config = smoke(config, smoke_folder)
         return override(config, self.overrides)
 
+    def _try(self, config: "TrainConfig") -> None:
+        from poem_jax.experiments.parts.smoke import smoke
+        from poem_jax.training.loop import train
+
+        if self.export is not None or self._names_hosts():
+            raise ValueError("--smoke is one process that keeps nothing: give it neither --export nor hosts")
+        with tempfile.TemporaryDirectory(prefix="poem_smoke_") as folder:
+            say(f"trying {config.name} in {folder}")
+            state = train(smoke(config, Path(folder)))
+        print(f"{config.name}: {int(state.step)} steps of a tiny likeness were taken; nothing is kept")
+
+    def _names_hosts(self) -> bool:
+        return any(
+            option is not None for option in (self.hosts, self.coordinator, self.num_hosts, self.host_index)
+        )
+
     def _join_hosts(self) -> None:
-        named = (self.coordinator, self.num_hosts, self.host_index)
-        if self.hosts is None and named == (None, None, None):
+        if not self._names_hosts():
             return
+        named = (self.coordinator, self.num_hosts, self.host_index)
         from poem_jax.training.hosts import start_hosts
 
         if self.hosts is not None and named != (None, None, None):
@@ -103,8 +113,7 @@ class Train:
         out, steps = config.train.out, config.train.steps
         with tells_what_is_left(Path(out)):
             state = train(config)
-        where = "nothing is kept" if self.smoke else f"checkpoints and metrics are in {out}"
-        print(f"step {int(state.step)} of {steps}; {where}")
+        print(f"step {int(state.step)} of {steps}; checkpoints and metrics are in {out}")
 
     def _export(self, config: "TrainConfig") -> None:
         from poem_jax.io.writable import check_folder_is_writable

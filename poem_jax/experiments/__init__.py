@@ -1,7 +1,8 @@
 """The experiments that ship with the package, and the way to open them or your own.
 
 One Python file each: its docstring says what is trained, on which hardware, in what time, and which number to
-expect; its variable `config` is the whole `TrainConfig`.
+expect; its variable `config` is the whole `TrainConfig`. One that is several, which differ in a word, has the
+others in `configs`, opened as `v1_paper:mvp-ho3d`.
 """
 
 import importlib
@@ -17,14 +18,20 @@ def open_experiment(name: str | Path) -> TrainConfig:
 
     Args:
         name: An experiment of the package, such as `tiny_synthetic`, or the path of a Python file that
-            defines `config = TrainConfig(...)`.
+            defines `config = TrainConfig(...)`; of a file with several, `NAME:WHICH`.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The package has no experiment of that name, or the file defines no `config`.
+        ValueError: The package has no experiment of that name, or the file defines no `config`, or none of
+            that name among its `configs`.
     """
-    module = _from_file(Path(name)) if _is_path(name) else _from_package(str(name))
-    config = getattr(module, "config", None)
+    file, _, which = (str(name), "", "") if Path(name).is_file() else str(name).partition(":")
+    module = _from_file(Path(file)) if isinstance(name, Path) or _is_path(file) else _from_package(file)
+    configs = getattr(module, "configs", {})
+    if which and which not in configs:
+        has = f"has {', '.join(configs)}" if configs else "is one experiment, with nothing behind a colon"
+        raise ValueError(f"no experiment is called {name!s}; {file} {has}")
+    config = configs[which] if which else getattr(module, "config", None)
     if not isinstance(config, TrainConfig):
         raise ValueError(
             f"{module.__file__} must define `config = TrainConfig(...)`; it defines {_public_names(module)}"
@@ -38,8 +45,8 @@ def experiment_names() -> list[str]:
     return [file.stem for file in files if file.stem not in ("__init__", "synthetic_benchmark")]
 
 
-def _is_path(name: str | Path) -> bool:
-    return isinstance(name, Path) or name.endswith(".py") or len(Path(name).parts) != 1
+def _is_path(name: str) -> bool:
+    return name.endswith(".py") or len(Path(name).parts) != 1
 
 
 def _from_package(name: str) -> ModuleType:

@@ -3,8 +3,8 @@
 What:      joint decoder and decoder of tiny_synthetic from the shipped weights, on other data (seed 4).
            Not the sittings that made them, which read stored maps (docs/shipped_model.md).
 Hardware:  2 CPU cores at the lowest priority; the same command uses every GPU or TPU it finds.
-Time:      20,000 steps of 16 captures; see docs/shipped_model.md for the rate. The same command goes on where the
-           last one stopped.
+Time:      20,000 steps of 16 captures; see docs/shipped_model.md for the rate. The same command goes on where
+           the last one stopped.
 Expected:  see docs/shipped_model.md.
 Command:   poem train tiny_second_stage
 Then:      poem train tiny_second_stage --export poem_jax/weights/tiny

@@ -1,0 +1,3 @@
+"""`v2_param_six_sets`, which stands in poem_jax/experiments/."""
+
+from poem_jax.experiments.v2_param_six_sets import config as config
