@@ -134,6 +134,37 @@ class _Points(NamedTuple):
     vertices: Float[Array, "batch 778 3"]
 
 
+class Share(NamedTuple):
+    """Which share of a batch is at hand. Means over it are shares, too: their sum is the whole batch's mean.
+
+    Of a batch that is split over devices the sum runs over `axis_name`, and the shares know how many entries
+    all of them have. Of one that is taken part by part they know what exists in all parts, not what will be
+    solved: a part that cannot solve a sample takes the mean of its others.
+    """
+
+    axis_name: str | None = None
+    """Mapped axis over which the batch is split."""
+    views: Float[Array, ""] | None = None
+    """How many of the batch's existing views are in this part, 0 to 1; None = the batch is taken at once."""
+    samples: Float[Array, ""] | None = None
+    """The same of its samples."""
+
+    def over_views(self, values: Float[Array, "..."], mask: Bool[Array, "batch view"]) -> Float[Array, ""]:
+        """Return this share of the mean over the views that count."""
+        mean = masked_mean(values, mask, axis_name=self.axis_name)
+        return mean if self.views is None else self.views * mean
+
+    def over_samples(
+        self, values: Float[Array, "..."], mask: Bool[Array, "batch *#rest"]
+    ) -> Float[Array, ""]:
+        """Return this share of the mean over the samples, or their points, that count."""
+        mean = masked_mean(values, mask, axis_name=self.axis_name)
+        return mean if self.samples is None else self.samples * mean
+
+
+WHOLE = Share()
+
+
 def masked_mean(
     values: Float[Array, "..."], mask: Bool[Array, "..."], *, axis_name: str | None = None
 ) -> Float[Array, ""]:
@@ -163,7 +194,7 @@ def multi_view_losses(
     image_hw: tuple[int, int],
     recipe: LossRecipe,
     query_order: QueryOrder = QueryOrder.VERTICES_FIRST,
-    axis_name: str | None = None,
+    share: Share = WHOLE,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Compute the weighted training loss and its unweighted terms.
 
@@ -179,7 +210,7 @@ def multi_view_losses(
         image_hw: height and width of the crops as fed.
         recipe: weights and forms; static.
         query_order: layout of `prediction.layers_world`.
-        axis_name: as in `masked_mean`; losses and terms are then shares whose `psum` is the global value.
+        share: which share of a batch this is; losses and terms are then shares whose sum is the global value.
 
     Returns:
         The loss, and the terms by name (of the last layer; point terms in `recipe.point_unit_m`).
@@ -192,11 +223,9 @@ def multi_view_losses(
     cameras = fill_masked_views(Cameras(batch.cameras.K, batch.cameras.T_cam_from_world, view_mask))
     truth = _Points(batch.joints_world, batch.vertices_world)
 
-    first_stage = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=recipe, axis_name=axis_name)
+    first_stage = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=recipe, share=share)
     if recipe.triangulation:
-        first_stage["triangulation"] = triangulation_term(
-            prediction, batch, recipe=recipe, axis_name=axis_name
-        )
+        first_stage["triangulation"] = triangulation_term(prediction, batch, recipe=recipe, share=share)
 
     compare = partial(
         _point_terms,
@@ -207,13 +236,13 @@ def multi_view_losses(
         hand=hand,
         diagonal=diagonal,
         recipe=recipe,
-        axis_name=axis_name,
+        share=share,
     )
     layer_terms = [compare(points) for points in _supervised(prediction, recipe.layers, query_order)]
     terms = {
         **first_stage,
         **layer_terms[-1],
-        **_parametric_terms(prediction, batch, cameras, sample_mask, recipe.pose_space, axis_name),
+        **_parametric_terms(prediction, batch, cameras, sample_mask, recipe.pose_space, share),
     }
     loss = weighted(first_stage, recipe)
     for term in layer_terms:
@@ -228,7 +257,7 @@ def keypoint_terms(
     *,
     image_hw: tuple[int, int],
     recipe: LossRecipe,
-    axis_name: str | None = None,
+    share: Share = WHOLE,
 ) -> dict[str, Float[Array, ""]]:
     """Compute the terms of the first stage in the images, `keypoints` and, where the recipe weighs it,
     `heat_maps`; none for a model without heat maps.
@@ -242,16 +271,16 @@ def keypoint_terms(
     view_mask, _ = valid_masks(prediction, batch)
     truth_px = match_keypoints(prediction.keypoints_px, batch)
     residual = (prediction.keypoints_px - truth_px) / _diagonal(image_hw)
-    terms = {"keypoints": _mean_of_norms(residual, view_mask, recipe.keypoint_penalty, axis_name)}
+    terms = {"keypoints": _mean_of_norms(residual, view_mask, recipe.keypoint_penalty, share)}
     if recipe.heat_maps and prediction.heat_maps is not None:
         cells = truth_px * (prediction.heat_maps.shape[-1] / image_hw[1])
         entropy = _cross_entropy(prediction.heat_maps, cells, recipe.heat_map_sigma)
-        terms["heat_maps"] = masked_mean(entropy, view_mask, axis_name=axis_name)
+        terms["heat_maps"] = share.over_views(entropy, view_mask)
     return terms
 
 
 def triangulation_term(
-    prediction: Prediction, batch: MultiViewBatch, *, recipe: LossRecipe, axis_name: str | None = None
+    prediction: Prediction, batch: MultiViewBatch, *, recipe: LossRecipe, share: Share = WHOLE
 ) -> Float[Array, ""]:
     """Compute the mean squared error of the joints that could be triangulated, also in samples whose second
     stage does not count, since this loss is what brings those back.
@@ -262,7 +291,7 @@ def triangulation_term(
     solved = prediction.reference_joints_mask
     exists = jnp.any(valid_masks(prediction, batch)[0], -1)
     counted = exists[:, None] & (jnp.ones(NUM_JOINTS, bool) if solved is None else solved)
-    return masked_mean((joints - batch.joints_world) ** 2, counted, axis_name=axis_name)
+    return share.over_samples((joints - batch.joints_world) ** 2, counted)
 
 
 def _present(value: Array | None, weight: str, recipe: LossRecipe) -> Array:
@@ -299,11 +328,16 @@ def valid_masks(
     prediction: Prediction, batch: MultiViewBatch
 ) -> tuple[Bool[Array, "batch view"], Bool[Array, " batch"]]:
     """Return the views whose 2D terms count and the samples whose 3D terms count."""
+    view_mask, sample_mask = existing_masks(batch)
+    return view_mask, sample_mask & prediction.valid
+
+
+def existing_masks(batch: MultiViewBatch) -> tuple[Bool[Array, "batch view"], Bool[Array, " batch"]]:
+    """Return the views and samples that are no padding."""
     sample_mask = jnp.any(jnp.asarray(batch.cameras.view_mask), axis=-1)
     if batch.sample_mask is not None:
         sample_mask = sample_mask & batch.sample_mask
-    view_mask = batch.cameras.view_mask & sample_mask[:, None]
-    return view_mask, sample_mask & prediction.valid
+    return batch.cameras.view_mask & sample_mask[:, None], sample_mask
 
 
 def match_keypoints(
@@ -334,7 +368,7 @@ def _point_terms(
     hand: HandModel,
     diagonal: float,
     recipe: LossRecipe,
-    axis_name: str | None,
+    share: Share,
 ) -> dict[str, Array]:
     """Compute the four terms of one decoder layer, or five."""
     _, T_primary_from_world = anchor_to_primary(cameras.T_cam_from_world, cameras.view_mask)
@@ -344,7 +378,7 @@ def _point_terms(
         return rotate_points(rotation, a_world - b_world) / recipe.point_unit_m
 
     def mean(residual: Array, penalty: Penalty) -> Array:
-        return masked_mean(_punish(residual, penalty), sample_mask, axis_name=axis_name)
+        return share.over_samples(_punish(residual, penalty), sample_mask)
 
     regressed = joints_from_vertices(hand, points.vertices)
     regressed_truth = joints_from_vertices(hand, truth.vertices)
@@ -353,7 +387,7 @@ def _point_terms(
     def in_images(points_world: Array, target_px: Array) -> Array:
         residual = (_projected(cameras, points_world) - target_px) / diagonal
         residual = jnp.clip(residual, -recipe.reprojection_limit, recipe.reprojection_limit)
-        return _mean_of_norms(residual, view_mask, recipe.reprojection_penalty, axis_name)
+        return _mean_of_norms(residual, view_mask, recipe.reprojection_penalty, share)
 
     terms = {
         "joints": mean(difference(points.joints, truth.joints), recipe.joint_penalty),
@@ -376,7 +410,7 @@ def _parametric_terms(
     cameras: Cameras,
     sample_mask: Array,
     space: PoseSpace,
-    axis_name: str | None,
+    share: Share,
 ) -> dict[str, Array]:
     """Compare pose and shape where both sides have them; poses in the primary camera's frame."""
     terms = {}
@@ -388,10 +422,10 @@ def _parametric_terms(
         if space is PoseSpace.AXIS_ANGLE:
             root = axis_angle_from_rotation(truth[:, :1])
             pose, truth = released_axis_angle(pose), jnp.concatenate([root, batch.pose[:, 1:]], 1)
-        terms["pose"] = masked_mean((pose - truth) ** 2, sample_mask, axis_name=axis_name)
+        terms["pose"] = share.over_samples((pose - truth) ** 2, sample_mask)
     if prediction.shape is not None and batch.shape is not None:
         residual = prediction.shape - batch.shape
-        terms["shape"] = masked_mean(residual**2, sample_mask, axis_name=axis_name)
+        terms["shape"] = share.over_samples(residual**2, sample_mask)
     return terms
 
 
@@ -426,6 +460,6 @@ def _punish(residual: Array, penalty: Penalty) -> Array:
     return residual**2 if penalty is Penalty.SQUARED else jnp.abs(residual)
 
 
-def _mean_of_norms(residual: Array, mask: Array, penalty: Penalty, axis_name: str | None) -> Array:
+def _mean_of_norms(residual: Array, mask: Array, penalty: Penalty, share: Share) -> Array:
     """Average over points the penalties summed over u and v."""
-    return masked_mean(_punish(residual, penalty).sum(-1), mask, axis_name=axis_name)
+    return share.over_views(_punish(residual, penalty).sum(-1), mask)

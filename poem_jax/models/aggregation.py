@@ -13,13 +13,14 @@ from flax import nnx
 
 from poem_jax.models.config import AggregationConfig, Design, Similarity
 from poem_jax.models.layers import linear
+from poem_jax.models.recompute import DecoderRow
 from poem_jax.typing import Array, Bool, Float, Int
 
 _POINTS_AT_A_TIME = 512
 """Points that are fused together: few enough for a CPU's cache."""
 
 
-class ProjectiveAggregation(nnx.Module):
+class ProjectiveAggregation(DecoderRow):
     """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)) / N, exactly f1 where one view is valid; or, for
     `Similarity.EQUAL`, all views alike."""
 
@@ -43,11 +44,11 @@ class ProjectiveAggregation(nnx.Module):
             features = row_major_tokens(features, jnp.sum(view_mask, axis=-1))
         batch, _, points, c = features.shape
         if points % _POINTS_AT_A_TIME or points == _POINTS_AT_A_TIME:
-            return self._fused(features, view_mask, primary)
+            return self.lean(self._fused)(features, view_mask, primary)
 
         def part(start: Array) -> Array:
             taken = jax.lax.dynamic_slice_in_dim(features, start, _POINTS_AT_A_TIME, axis=2)
-            return self._fused(taken, view_mask, primary)
+            return self.lean(self._fused)(taken, view_mask, primary)
 
         parts = jax.lax.map(part, jnp.arange(0, points, _POINTS_AT_A_TIME))
         return jnp.moveaxis(parts, 0, 1).reshape(batch, points, c)

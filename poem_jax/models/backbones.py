@@ -11,6 +11,7 @@ from jax.core import Tracer
 
 from poem_jax.models.config import FrozenNorms, HRNetConfig, ResNetConfig, Stem
 from poem_jax.models.layers import ConvNorm, NormMode, repeat_pixels
+from poem_jax.models.recompute import TrunkRow
 from poem_jax.typing import Array, Float
 
 BOTTLENECK_EXPANSION = 4
@@ -67,7 +68,7 @@ def stacked_axes(path: Sequence[str]) -> int:
     return sum(not path[i + 1].isdigit() for i in blocks)
 
 
-class Stack(nnx.Module):
+class Stack(TrunkRow):
     """`num_blocks` blocks of one kind applied one after the other, their weights stacked.
 
     At inference one `lax.scan` runs them: it compiles a block once instead of n times, and keeps XLA from
@@ -92,7 +93,7 @@ class Stack(nnx.Module):
 
         @nnx.scan(in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)
         def run(carry: _Carry, block: Callable[..., _Carry]) -> _Carry:
-            return block(carry, mode)
+            return self.run(block, carry, mode)
 
         return run(x, self.blocks)
 
@@ -102,7 +103,7 @@ class Stack(nnx.Module):
         states = []
         for i in range(self.num_blocks):
             block: Any = nnx.merge(graph, jax.tree.map(lambda stacked, i=i: stacked[i], weights))
-            x = block(x, mode)
+            x = self.run(block, x, mode)
             states.append(nnx.state(block))
         nnx.update(self.blocks, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
         return x
@@ -118,7 +119,7 @@ def _stack_weights(*weights: Array) -> Array:
 _SPACE_TO_DEPTH = 4
 
 
-class ResNet(nnx.Module):
+class ResNet(TrunkRow):
     """Stem and stages of residual blocks."""
 
     def __init__(self, config: ResNetConfig, *, rngs: nnx.Rngs) -> None:
@@ -134,13 +135,13 @@ class ResNet(nnx.Module):
 
     def __call__(self, images: Float[Array, "image h w 3"], mode: NormMode) -> tuple[Array, ...]:
         """Return the feature maps (image, h / s, w / s, c) for every stride s, finest first."""
-        levels = [self.stem(images, mode)]
+        levels = [self.run(self.stem, images, mode)]
         for stage in self.stages:
             levels.append(stage(levels[-1], mode))
         return tuple(levels[1:])
 
 
-class Stage(nnx.Module):
+class Stage(TrunkRow):
     """A block that changes stride and width, then identical blocks.
 
     Not a `Stack`: XLA:CPU runs the gradients of convolutions inside a loop a hundred times slower.
@@ -164,7 +165,7 @@ class Stage(nnx.Module):
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h2 w2 c2"]:
         """Apply the stage."""
         for block in self.blocks:
-            x = block(x, mode)
+            x = self.run(block, x, mode)
         return x
 
 
@@ -195,7 +196,7 @@ class SpaceToDepthStem(nnx.Module):
         return self.conv(cells.reshape(image, h // s, w // s, s * s * c), mode)
 
 
-class HRNet(nnx.Module):
+class HRNet(TrunkRow):
     """Stem, four bottlenecks, and three stages of exchange modules over 2, 3 and 4 branches."""
 
     def __init__(self, config: HRNetConfig, *, rngs: nnx.Rngs) -> None:
@@ -219,18 +220,18 @@ class HRNet(nnx.Module):
         """Return the feature maps (image, h / s, w / s, c) for s = 4, 8, 16, 32."""
         x = images
         for conv in self.stem:
-            x = conv(x, mode)
-        x = self.layer1(self.widen(x, mode), mode)
-        branches = self.stage2(tuple(start(x, mode) for start in self.transition1), mode)
-        branches = self.stage3((*branches, self.transition2(branches[-1], mode)), mode)
-        return self.stage4((*branches, self.transition3(branches[-1], mode)), mode)
+            x = self.run(conv, x, mode)
+        x = self.layer1(self.run(self.widen, x, mode), mode)
+        branches = self.stage2(tuple(self.run(start, x, mode) for start in self.transition1), mode)
+        branches = self.stage3((*branches, self.run(self.transition2, branches[-1], mode)), mode)
+        return self.stage4((*branches, self.run(self.transition3, branches[-1], mode)), mode)
 
 
 def _module_maker(channels: tuple[int, ...], num_blocks: int) -> Any:
     return lambda rngs: ExchangeModule(channels, num_blocks, rngs=rngs)
 
 
-class ExchangeModule(nnx.Module):
+class ExchangeModule(TrunkRow):
     """Residual blocks in every branch, then every branch receives the sum of all."""
 
     def __init__(self, channels: tuple[int, ...], num_blocks: int, *, rngs: nnx.Rngs) -> None:
@@ -240,7 +241,7 @@ class ExchangeModule(nnx.Module):
     def __call__(self, maps: tuple[Array, ...], mode: NormMode) -> tuple[Array, ...]:
         """Apply the module to one map per branch."""
         maps = tuple(branch(x, mode) for branch, x in zip(self.branches, maps, strict=True))
-        return tuple(fuse(maps, mode) for fuse in self.fuse)
+        return tuple(self.run(fuse, maps, mode) for fuse in self.fuse)
 
 
 def _block_maker(channels: int) -> Any:

@@ -21,6 +21,7 @@ from poem_jax.models.config import DecoderConfig, DecoderOutput, Design, JointDe
 from poem_jax.models.hand_output import palm_frame
 from poem_jax.models.layers import dropout, layer_norm, linear, normal
 from poem_jax.models.point_features import projected_features
+from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
     Neighbours,
@@ -57,7 +58,7 @@ def shared(surroundings: Surroundings, batch_size: int) -> Surroundings:
     return Surroundings(spread(basis), None if queries is None else spread(queries))
 
 
-class Decoder(nnx.Module):
+class Decoder(DecoderRow):
     """Learned query embeddings and a row of layers that each move the query points."""
 
     def __init__(self, config: DecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
@@ -94,7 +95,7 @@ class Decoder(nnx.Module):
             if self.locate is not None:
                 embeddings = embeddings + self.locate(queries)
             key = None if dropout_key is None else jax.random.fold_in(dropout_key, i)
-            embeddings, queries = layer(embeddings, queries, features, surroundings, key)
+            embeddings, queries = self.run(layer, embeddings, queries, features, surroundings, key)
             moved.append(queries)
         return moved[: len(moved) - (self.config.output is DecoderOutput.HAND_PARAMETERS)], embeddings
 
@@ -221,7 +222,7 @@ class OffsetNetwork(nnx.Module):
 
     def __init__(self, width: int, hidden: int, *, rngs: nnx.Rngs) -> None:
         self.hidden = linear(width, hidden, rngs=rngs)
-        self.offset = nnx.Linear(hidden, 3, kernel_init=nnx.initializers.zeros, rngs=rngs)
+        self.offset = linear(hidden, 3, exact=True, zero=True, rngs=rngs)
 
     def __call__(self, embeddings: Float[Array, "batch query c"]) -> Float[Array, "batch query 3"]:
         """Regress offsets."""
@@ -318,17 +319,20 @@ def _attend(
 ) -> Float[Array, "query c"]:
     """Let the queries of one head read its tokens."""
     q, k, v, key, mask = arguments
-    logits = (q * q.shape[-1] ** -0.5) @ k.T
+    # Half numbers would lose what tells logits apart, and their sums; products add up in float32 anyway.
+    kept = jnp.promote_types(v.dtype, jnp.float32)
+    logits = jnp.matmul(q * q.shape[-1] ** -0.5, k.T, preferred_element_type=kept)
     if mask is not None:
         # Not minus infinity, of which a row without any valid token would make NaN.
         logits = jnp.where(mask, logits, jnp.finfo(logits.dtype).min)
     weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, -1, keepdims=True)))
     total = jnp.sum(weights, -1, keepdims=True)
     # Divided last: the map is passed over once less.
-    return (dropout(weights, dropout_rate, key) @ v) / total
+    weights = dropout(weights, dropout_rate, key).astype(v.dtype)
+    return (jnp.matmul(weights, v, preferred_element_type=kept) / total).astype(v.dtype)
 
 
-class JointDecoder(nnx.Module):
+class JointDecoder(DecoderRow):
     """A row of layers that each move the 21 joints, before they pose the template (ours, not the paper's).
 
     Triangulation joins the views by one point per heat map. A map says more: it is wide, or has two peaks,
@@ -388,7 +392,7 @@ class JointDecoder(nnx.Module):
                 ],
                 -1,
             )
-            joints = joints + rotate_points(transpose(to_hand), _OFFSET_M * layer(tokens))
+            joints = joints + rotate_points(transpose(to_hand), _OFFSET_M * self.run(layer, tokens))
             moved.append(joints)
         return moved
 
@@ -404,7 +408,7 @@ class JointLayer(nnx.Module):
         self.names = nnx.Param(normal(rngs.params(), (NUM_JOINTS, config.width), _EMBEDDING_SCALE))
         self.blocks = nnx.List(JointBlock(config, rngs=rngs) for _ in range(config.num_blocks))
         self.norm = layer_norm(config.width, PAPER_EPSILON, rngs=rngs)
-        self.offset = nnx.Linear(config.width, 3, kernel_init=nnx.initializers.zeros, rngs=rngs)
+        self.offset = linear(config.width, 3, exact=True, zero=True, rngs=rngs)
 
     def __call__(self, tokens: Float[Array, "batch 21 number"]) -> Float[Array, "batch 21 3"]:
         """Return the joints' offsets, in centimetres along the axes of the hand's frame."""

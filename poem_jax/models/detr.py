@@ -12,10 +12,11 @@ from flax import nnx
 from poem_jax.models.decoder import PAPER_EPSILON, MultiHeadAttention
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.layers import dropout, layer_norm, linear
+from poem_jax.models.recompute import DecoderRow
 from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
 
 
-class DetrDecoder(nnx.Module):
+class DetrDecoder(DecoderRow):
     """A row of layers, and one layer norm through which the embeddings pass where they are read out."""
 
     def __init__(self, config: DetrConfig, width: int, *, rngs: nnx.Rngs) -> None:
@@ -44,7 +45,7 @@ class DetrDecoder(nnx.Module):
         keys = tokens if token_codes is None else tokens + token_codes
         for i, layer in enumerate(self.layers):
             key = None if dropout_key is None else jax.random.fold_in(dropout_key, i)
-            embeddings = layer(embeddings, query_codes, keys, tokens, token_mask, key)
+            embeddings = self.run(layer, embeddings, query_codes, keys, tokens, token_mask, key)
             read_out.append(self.norm(embeddings))
         return jnp.stack(read_out, 1)
 

@@ -26,7 +26,7 @@ from poem_jax.hand.topology import (
     join_queries,
     split_queries,
 )
-from poem_jax.models.layers import linear
+from poem_jax.models.layers import Exact, linear
 from poem_jax.typing import Array, Bool, Float
 
 _SKELETON = np.array(SKELETON_FROM_OPENPOSE, np.int32)
@@ -121,12 +121,12 @@ class ParameterRegressor(nnx.Module):
         self.row_major = row_major
         self.pool = linear(NUM_QUERIES, 1, rngs=rngs)
         numbers = NUM_SKELETON_JOINTS * len(_IDENTITY_6D) + NUM_SHAPES
-        self.regress = linear(width, numbers, rngs=rngs)
-        self.regress.kernel = nnx.Param(_SMALL * self.regress.kernel[...])
+        self.regress = linear(width, numbers, exact=True, rngs=rngs)
+        self.regress.kernel = Exact(_SMALL * self.regress.kernel[...])
         flat_hand = jnp.concatenate(
             [jnp.tile(jnp.array(_IDENTITY_6D), NUM_SKELETON_JOINTS), jnp.zeros(NUM_SHAPES)]
         )
-        self.regress.bias = nnx.Param(flat_hand)
+        self.regress.bias = Exact(flat_hand)
 
     def __call__(self, embeddings: Float[Array, "batch query c"]) -> HandParameters:
         """Regress the parameters."""

@@ -27,7 +27,7 @@ class HeatMapBranch(nnx.Module):
         self.stride, self.cell_offset = config.stride, config.cell_offset
         self.pooling, self.sum_epsilon = config.pooling, config.sum_epsilon
         self.branch = TopDownBranch(trunk.channels, trunk.strides, config.branch_stride, bias=bias, rngs=rngs)
-        self.to_logits = Conv(self.branch.c_out, config.num_joints, 1, bias=True, rngs=rngs)
+        self.to_logits = Conv(self.branch.c_out, config.num_joints, 1, bias=True, exact=True, rngs=rngs)
         self.activation = config.activation
 
     def __call__(

@@ -3,6 +3,9 @@
 Flax's own stand in the decoder. Ours are those that win: batch norm over the views that exist, 1 x 1
 convolutions as matrix products and enlargements as broadcasts, several times faster on a CPU.
 
+A layer computes in the number type of its weights, whatever it is given (`in_type_of_weights`), so that the
+weights alone say what a model computes in; `precision.py` casts them. `Exact` ones are never cast.
+
 Weights are drawn by NumPy, seeded by the JAX key: compiling JAX's generators for every shape of a large model
 takes a minute. Under a trace JAX draws them: other numbers of the same distribution.
 """
@@ -19,6 +22,7 @@ from jax.core import Tracer
 
 from poem_jax.models import winograd
 from poem_jax.models.config import ModelConfig
+from poem_jax.models.recompute import TrunkRow
 from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
 
 BATCH_NORM_EPSILON = 1e-5
@@ -40,6 +44,16 @@ class NormMode(NamedTuple):
         return self.image_mask is not None
 
 
+class Exact(nnx.Param):
+    """A weight that keeps its precision where others are cast: of a norm, or of a layer that gives
+    coordinates or a logit. So what it gives is in float32, too."""
+
+
+def in_type_of_weights(arrays: tuple[Array, Array, Array | None], *, dtype: Any = None) -> tuple:
+    """Cast (inputs, kernel, bias) to the kernel's type; `dtype` is of no account."""
+    return tuple(None if x is None else jnp.asarray(x, arrays[1].dtype) for x in arrays)
+
+
 def trunk_images(
     views: Num[Array, "*batch h w 3"], config: ModelConfig, dtype: Any
 ) -> Float[Array, "image h w 3"]:
@@ -58,7 +72,7 @@ class MaskedBatchNorm(nnx.Module):
     """
 
     def __init__(self, channels: int) -> None:
-        self.scale, self.bias = nnx.Param(filled(1.0, channels)), nnx.Param(filled(0.0, channels))
+        self.scale, self.bias = Exact(filled(1.0, channels)), Exact(filled(0.0, channels))
         self.mean, self.variance = nnx.BatchStat(filled(0.0, channels)), nnx.BatchStat(filled(1.0, channels))
 
     def __call__(self, x: Float[Array, "image h w c"], mode: NormMode) -> Float[Array, "image h w c"]:
@@ -68,7 +82,7 @@ class MaskedBatchNorm(nnx.Module):
             mean, variance, count = masked_moments(x, mode.image_mask, mode.axis_name)
             self._move_towards(mean, variance, count)
         gain = self.scale[...] * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)
-        return x * gain + (self.bias[...] - mean * gain)
+        return (x * gain + (self.bias[...] - mean * gain)).astype(x.dtype)
 
     def _move_towards(self, mean: Array, variance: Array, count: Array) -> None:
         share = jnp.where(count > 0, BATCH_NORM_MOMENTUM, 0.0)
@@ -91,18 +105,19 @@ class FrozenBatchNorm(nnx.Module):
             jax.lax.stop_gradient(leaf[...]) for leaf in (self.scale, self.bias, self.mean, self.variance)
         )
         gain = scale * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)
-        return x * gain + (bias - mean * gain)
+        return (x * gain + (bias - mean * gain)).astype(x.dtype)
 
 
 def masked_moments(
     x: Float[Array, "image h w c"], image_mask: Bool[Array, " image"], axis_name: str | None = None
 ) -> tuple[Float[Array, " c"], Float[Array, " c"], Float[Array, ""]]:
-    """Return mean, biased variance and number of pixels over the valid images; without any: 0, 0, 0.
+    """Return mean, biased variance and number of pixels over the valid images, in float32 at least; without
+    any: 0, 0, 0.
 
     In two passes: the mean of the squares less the square of the mean would lose all digits of a variance
     that is small beside the mean.
     """
-    mask = image_mask[:, None, None, None]
+    mask, x = image_mask[:, None, None, None], at_least_float32(x)
 
     def total(values: Array) -> Array:
         summed = jnp.sum(jnp.where(mask, values, 0), (0, 1, 2))
@@ -126,17 +141,28 @@ class Conv(nnx.Module):
     """Square convolution with padding (size - 1) / 2; size 1 is a matrix product, far faster on a CPU."""
 
     def __init__(
-        self, c_in: int, c_out: int, size: int, stride: int = 1, *, bias: bool = False, rngs: nnx.Rngs
+        self,
+        c_in: int,
+        c_out: int,
+        size: int,
+        stride: int = 1,
+        *,
+        bias: bool = False,
+        exact: bool = False,
+        rngs: nnx.Rngs,
     ) -> None:
+        """`exact`: with `Exact` weights."""
         self.stride, self.size = stride, size
-        self.kernel = nnx.Param(he_normal(rngs.params(), (size, size, c_in, c_out)))
-        self.bias = nnx.Param(filled(0.0, c_out)) if bias else None
+        weight = Exact if exact else nnx.Param
+        self.kernel = weight(he_normal(rngs.params(), (size, size, c_in, c_out)))
+        self.bias = weight(filled(0.0, c_out)) if bias else None
 
     def __call__(
         self, x: Float[Array, "image h w c"], *, training: bool = False
     ) -> Float[Array, "image h2 w2 c2"]:
         """Convolve. In `training` gradients may have a form of their own, which knows no forward mode and, in
         a `shard_map`, wants `check_vma=False`."""
+        x = x.astype(self.kernel[...].dtype)
         y = self._pointwise(x) if self.size == 1 else self._windowed(x, training)
         return y if self.bias is None else y + self.bias[...]
 
@@ -236,7 +262,7 @@ class ConvNorm(nnx.Module):
         return jax.nn.relu(y) if self.relu else y
 
 
-class TopDownBranch(nnx.Module):
+class TopDownBranch(TrunkRow):
     """From the coarsest map upwards: double the resolution, concatenate the next finer map, convolve.
 
     The design of the heat-map branch (paper, section "Heatmap-based Root Estimation") and, in the paper, of
@@ -265,7 +291,7 @@ class TopDownBranch(nnx.Module):
         coarse_to_fine = levels[self.finest :][::-1]
         x = coarse_to_fine[0]
         for merge, finer in zip(self.merges, coarse_to_fine[1:], strict=True):
-            x = merge(jnp.concatenate([double_bilinear(x), finer], -1), mode)
+            x = self.run(merge, jnp.concatenate([double_bilinear(x), finer], -1), mode)
         return x
 
 
@@ -321,14 +347,42 @@ def _double_axis(x: Array, axis: int) -> Array:
     return pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
 
 
-def linear(c_in: int, c_out: int, *, bias: bool = True, rngs: nnx.Rngs) -> nnx.Linear:
-    """Make an affine map of the last axis, drawn by `xavier_uniform`."""
-    return nnx.Linear(c_in, c_out, use_bias=bias, kernel_init=xavier_uniform, rngs=rngs)
+def linear(
+    c_in: int, c_out: int, *, bias: bool = True, exact: bool = False, zero: bool = False, rngs: nnx.Rngs
+) -> nnx.Linear:
+    """Make an affine map of the last axis, drawn by `xavier_uniform`, or `zero` at first; `exact`: with
+    `Exact` weights."""
+    layer = nnx.Linear(
+        c_in,
+        c_out,
+        use_bias=bias,
+        kernel_init=nnx.initializers.zeros if zero else xavier_uniform,
+        promote_dtype=in_type_of_weights,
+        rngs=rngs,
+    )
+    if exact:
+        layer.kernel = Exact(layer.kernel[...])
+        if layer.bias is not None:
+            layer.bias = Exact(layer.bias[...])
+    return layer
 
 
 def layer_norm(channels: int, epsilon: float, *, rngs: nnx.Rngs) -> nnx.LayerNorm:
-    """Make a normalisation of the last axis (Ba et al. 2016), its variance in two passes."""
-    return nnx.LayerNorm(channels, epsilon=epsilon, use_fast_variance=False, rngs=rngs)
+    """Make a normalisation of the last axis (Ba et al. 2016), its variance in two passes; the result has the
+    type of what is normalised."""
+    layer = _LayerNorm(channels, epsilon=epsilon, use_fast_variance=False, rngs=rngs)
+    layer.scale, layer.bias = (Exact(leaf[...]) for leaf in (layer.scale, layer.bias))
+    return layer
+
+
+class _LayerNorm(nnx.LayerNorm):
+    def __call__(self, x: Float[Array, "*batch c"], **options: Any) -> Float[Array, "*batch c"]:
+        return super().__call__(x, **options).astype(x.dtype)
+
+
+def at_least_float32(x: Array) -> Array:
+    """Cast half numbers to float32, for sums and exponentials that would lose their digits."""
+    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
 def dropout(x: Float[Array, "*shape"], rate: float, key: PRNGKeyArray | None) -> Float[Array, "*shape"]:

@@ -61,6 +61,7 @@ from poem_jax.models.frustum import (
 from poem_jax.models.layers import (
     Conv,
     ConvNorm,
+    Exact,
     NormMode,
     TopDownBranch,
     linear,
@@ -202,7 +203,8 @@ class EmbeddedPositions(nnx.Module):
         h, w, c = maps.shape[-3:]
         grid = jnp.swapaxes(frustum_grid(self.frustum, cams, (h, w), self.image_hw), 2, 3)
         codes = grid_point_code(normalised(grid, self.cuboid), c // self.frustum.num_depths)
-        return Tokens(_flattened(maps + codes.reshape(maps.shape)), None, _token_mask(cams.view_mask, h * w))
+        told = maps + codes.reshape(maps.shape).astype(maps.dtype)
+        return Tokens(_flattened(told), None, _token_mask(cams.view_mask, h * w))
 
 
 def grid_point_code(shares: Float[Array, "*batch 3"], width: int) -> Float[Array, "*batch c"]:
@@ -272,7 +274,8 @@ class CanonicalMaps(nnx.Module):
         assert self.fuse.bias is not None
         kernel = self.fuse.kernel[...].reshape(self.num_views, channels, self.num_views, self.width)
         kernel = kernel[:view, :, :view].reshape(view * channels, view * self.width)
-        fused = points.reshape(*points.shape[:-2], -1) @ kernel + self.fuse.bias[: view * self.width]
+        flat = points.reshape(*points.shape[:-2], -1).astype(kernel.dtype)
+        fused = flat @ kernel + self.fuse.bias[: view * self.width]
         return fused.reshape(*fused.shape[:-1], view, self.width)
 
 
@@ -379,7 +382,7 @@ class EmbeddedQueries(nnx.Module):
     def __call__(self, hand: HandModel) -> Queries:
         """Return the embeddings, and the middle of the cuboid."""
         codes = self.embeddings[...]
-        return Queries(codes, jnp.full((NUM_QUERIES, 3), 0.5, codes.dtype))
+        return Queries(codes, jnp.full((NUM_QUERIES, 3), 0.5, hand.v_template.dtype))
 
 
 class ReferenceQueries(nnx.Module):
@@ -389,7 +392,7 @@ class ReferenceQueries(nnx.Module):
     def __init__(self, config: MeshTransformerConfig, *, rngs: nnx.Rngs) -> None:
         self.axis_width, self.order = config.width // 2, config.query_order
         self.with_template = isinstance(config.fusion, PositionEmbeddedFusion)
-        self.points = nnx.Param(uniform(rngs.params(), (NUM_QUERIES, 3)))
+        self.points = Exact(uniform(rngs.params(), (NUM_QUERIES, 3)))
         numbers = 3 * self.axis_width + (3 if self.with_template else 0)
         self.hidden = linear(numbers, config.width, rngs=rngs)
         self.out = linear(config.width, config.width, rngs=rngs)
@@ -408,7 +411,7 @@ class ReadOutNetwork(nnx.Module):
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         self.hidden = nnx.List(linear(width, width, rngs=rngs) for _ in range(2))
-        self.out = linear(width, 3, rngs=rngs)
+        self.out = linear(width, 3, exact=True, rngs=rngs)
 
     def __call__(self, embeddings: Float[Array, "*batch c"]) -> Float[Array, "*batch 3"]:
         """Regress."""

@@ -78,6 +78,7 @@ from poem_jax.models.frustum import denormalised, sigmoid_step
 from poem_jax.models.hand_output import HandParameters
 from poem_jax.models.layers import (
     ConvNorm,
+    Exact,
     NormMode,
     dropout,
     layer_norm,
@@ -89,6 +90,7 @@ from poem_jax.models.layers import (
 from poem_jax.models.mvp_config import NUM_LEVELS, MvpConfig, MvpDecoderConfig
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.point_features import valid_views_first
+from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.world_frame import Reconstruction, WorkingFrame, leave_working_frame
 from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
 
@@ -109,7 +111,7 @@ class ViewLevels(NamedTuple):
     """Feature maps (*batch, h, w, c), coarsest first."""
 
 
-class Mvp(nnx.Module):
+class Mvp(DecoderRow):
     """MvP for one hand, its layers made for `config.num_views` views."""
 
     def __init__(self, config: MvpConfig, hand: HandModel, *, rngs: nnx.Rngs) -> None:
@@ -148,7 +150,7 @@ class Mvp(nnx.Module):
         joints, numbers = [], []
         for i, layer in enumerate(self.layers):
             drop = None if dropout_key is None else jax.random.fold_in(dropout_key, i)
-            x, shares, hand_numbers = layer(x, places, shares, scene, drop)
+            x, shares, hand_numbers = self.run(layer, x, places, shares, scene, drop)
             joints.append(shares)
             numbers.append(hand_numbers)
         shares, numbers = jnp.stack(joints, 1), jnp.stack(numbers, 1)
@@ -283,7 +285,7 @@ class _JointQueries(nnx.Module):
         width = config.width
         self.table = nnx.Param(normal(rngs.params(), (NUM_JOINTS, 2 * width)))
         self.mix = linear(config.num_views * NUM_LEVELS * width, width, rngs=rngs)
-        self.locate = linear(width, 3, rngs=rngs)
+        self.locate = linear(width, 3, exact=True, rngs=rngs)
 
     def _batch(self, x: Float[Array, "joint c"], size: int) -> Float[Array, "batch joint c"]:
         return jnp.broadcast_to(x, (size, *x.shape))
@@ -310,7 +312,7 @@ class ReleaseQueries(_JointQueries):
 
     def __init__(self, config: MvpConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(config, rngs=rngs)
-        self.locate.kernel = nnx.Param(uniform(rngs.params(), (config.width, 3)))
+        self.locate.kernel = Exact(uniform(rngs.params(), (config.width, 3)))
 
     def __call__(
         self, mean_features: Float[Array, "batch c"]
@@ -336,9 +338,9 @@ class _ProjectiveAttention(nnx.Module):
         self.num_heads, self.num_points = config.num_heads, config.num_points
         samples = config.num_heads * config.num_points
         self.ray_mix = linear(width + 3, width, rngs=rngs)
-        self.offsets = nnx.Linear(width, 2 * samples, kernel_init=nnx.initializers.zeros, rngs=rngs)
-        self.offsets.bias = nnx.Param(_first_offsets(config.num_heads, config.num_points))
-        self.weights = linear(width, samples, rngs=rngs)
+        self.offsets = linear(width, 2 * samples, exact=True, zero=True, rngs=rngs)
+        self.offsets.bias = Exact(_first_offsets(config.num_heads, config.num_points))
+        self.weights = linear(width, samples, exact=True, rngs=rngs)
         self.out = linear(width, width, rngs=rngs)
 
     def __call__(
@@ -424,8 +426,8 @@ class PaperHand(nnx.Module):
     def __init__(self, config: MvpConfig, *, rngs: nnx.Rngs) -> None:
         self.dropout_rate = config.decoder.dropout
         self.hidden = linear(NUM_JOINTS * config.width, config.width, rngs=rngs)
-        self.out = linear(config.width, _HAND_NUMBERS, rngs=rngs)
-        self.out.kernel = nnx.Param(_SMALL * self.out.kernel[...])
+        self.out = linear(config.width, _HAND_NUMBERS, exact=True, rngs=rngs)
+        self.out.kernel = Exact(_SMALL * self.out.kernel[...])
 
     def __call__(
         self, embeddings: Float[Array, "batch joint c"], dropout_key: PRNGKeyArray | None = None

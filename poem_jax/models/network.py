@@ -19,7 +19,8 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.layers import NormMode
+from poem_jax.models.layers import Exact, NormMode
+from poem_jax.models.recompute import Row, recompute
 from poem_jax.models.systems import MODULES
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array, Float, Int, Num, Params, PRNGKeyArray, PyTree
@@ -138,6 +139,7 @@ def forward(
     ball_index: Int[Array, "batch point"] | None = None,
     draw_key: PRNGKeyArray | None = None,
     axis_name: str | None = None,
+    recomputed: tuple[type[Row], ...] = (),
 ) -> tuple[Prediction, dict]:
     """Do what `apply` does without its checks, and return the batch-norm statistics too.
 
@@ -154,6 +156,7 @@ def forward(
         ball_index: as in `apply`.
         draw_key: the `key` of `apply`.
         axis_name: device axis over which the moments are averaged.
+        recomputed: kinds of rows whose insides are computed again in the backward pass.
 
     Returns: the prediction, and the new `params["statistics"]` (unchanged unless `train`).
 
@@ -162,6 +165,7 @@ def forward(
     """
     frame = enter_working_frame(views, cams, root_world, number_type(params))
     model = assemble(config, params)
+    recompute(model, recomputed)
     mode = NormMode(frame.cams.view_mask.reshape(-1) if train else None, axis_name)
     draw = Draw.of(config, ball_index, draw_key)
     dropout_key = key if train else None
@@ -270,6 +274,13 @@ def describe(config: ModelConfig) -> Params:
     """Return the shapes and dtypes that `init` would give, without computing anything."""
     states = _blueprint(config).states
     return {group: _nested(flat.items()) for group, flat in states.items()}
+
+
+@functools.lru_cache(maxsize=32)
+def exact_weights(config: ModelConfig) -> frozenset[tuple[str, ...]]:
+    """Return the paths in `params["trainable"]` of the weights that are never cast."""
+    weights = _blueprint(config).states["trainable"]
+    return frozenset(tuple(map(str, path)) for path, weight in weights.items() if isinstance(weight, Exact))
 
 
 def check_params(config: ModelConfig, params: Params) -> None:

@@ -82,6 +82,7 @@ from poem_jax.models.poem_v1_start import (
     space_of,
 )
 from poem_jax.models.point_features import projected_features, sine_code
+from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import Neighbours, VectorAttention, nearest_neighbours
 from poem_jax.models.world_frame import Reconstruction, WorkingFrame, leave_working_frame
 from poem_jax.typing import Array, Bool, Float, Int, Num, PRNGKeyArray
@@ -240,7 +241,7 @@ class ProjectedFeatures(nnx.Module):
     ) -> Float[Array, "batch basis c"]:
         """Return the features of the basis points."""
         sampled, uv_share = projected_features(maps, cams, points, self.image_hw)
-        told = sampled + sine_code(uv_share, sampled.shape[-1])
+        told = sampled + sine_code(uv_share, sampled.shape[-1]).astype(sampled.dtype)
         return self.aggregation(told, cams.view_mask, primary_view(cams.view_mask))
 
 
@@ -357,7 +358,7 @@ class PaperTokens(nnx.Module):
         return [space.leave(space.move(queries, offsets[:, i])) for i in range(offsets.shape[1])]
 
 
-class PaperDecoder(nnx.Module):
+class PaperDecoder(DecoderRow):
     """A row of layers that each move the query points; neighbours are searched anew in every layer."""
 
     def __init__(self, config: PointDecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
@@ -386,7 +387,7 @@ class PaperDecoder(nnx.Module):
         moved = []
         for layer in self.layers:
             near = nearest_neighbours(queries, points, self.num_neighbours, point_mask)
-            embeddings, offset = layer(embeddings, queries, features, near)
+            embeddings, offset = self.run(layer, embeddings, queries, features, near)
             queries = move(queries, offset)
             moved.append(queries)
         return moved

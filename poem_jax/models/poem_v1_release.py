@@ -48,6 +48,7 @@ from poem_jax.models.poem_v1_config import (
 )
 from poem_jax.models.poem_v1_start import Scene
 from poem_jax.models.point_features import ViewRowColumnCode
+from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import BracketedVectorAttention, nearest_neighbours
 from poem_jax.typing import Array, Bool, Float, Int
 
@@ -133,7 +134,7 @@ class CellCode(nnx.Module):
 # Features of the basis points, and of the query points.
 
 
-class UnnormalisedAggregation(nnx.Module):
+class UnnormalisedAggregation(DecoderRow):
     """f1 + phi(sum_j theta(f1) . theta(fj) theta(fj)), j over the valid views but the primary; phi's hidden
     layer is as narrow as its input."""
 
@@ -148,6 +149,9 @@ class UnnormalisedAggregation(nnx.Module):
         view_mask: Bool[Array, "batch view"],
     ) -> Float[Array, "batch point c"]:
         """Fuse the valid views into the primary one."""
+        return self.lean(self._fused)(features, view_mask)
+
+    def _fused(self, features: Array, view_mask: Array) -> Float[Array, "batch point c"]:
         primary = primary_view(view_mask)
         theta = self.theta_out(jax.nn.relu(self.theta_in(features)))
         similarity = jnp.sum(theta * _of_view(theta, primary)[:, None], -1)
@@ -384,7 +388,7 @@ _EMBEDDINGS = {
 # Decoder.
 
 
-class ReleaseDecoder(nnx.Module):
+class ReleaseDecoder(DecoderRow):
     """Basis points read each other once; then, layer by layer, queries read each other and the basis points,
     and move. Neighbours are searched anew in every layer."""
 
@@ -405,7 +409,7 @@ class ReleaseDecoder(nnx.Module):
         features = self.among_basis.among_queries(features, points, near)
         moved = []
         for layer in self.layers:
-            embeddings, queries = layer(embeddings, queries, features, points)
+            embeddings, queries = self.run(layer, embeddings, queries, features, points)
             moved.append(queries)
         return moved
 

@@ -19,7 +19,7 @@ from poem_jax.models.config import RootConfig
 from poem_jax.models.frustum import denormalised, normalised, sigmoid_step
 from poem_jax.models.frustum_config import Cuboid
 from poem_jax.models.heat_maps import root_point, triangulate_joints
-from poem_jax.models.layers import linear, uniform
+from poem_jax.models.layers import Exact, linear, uniform
 from poem_jax.models.poem_v1_config import OneStageConfig, PoemV1Config
 from poem_jax.models.world_frame import WorkingFrame
 from poem_jax.typing import Array, Bool, Float, Int, PRNGKeyArray
@@ -78,8 +78,8 @@ class LinearMesh(nnx.Module):
     mean."""
 
     def __init__(self) -> None:
-        self.kernel = nnx.Param(jnp.asarray(np.full((NUM_JOINTS, NUM_VERTICES), 1 / NUM_JOINTS, np.float32)))
-        self.bias = nnx.Param(jnp.asarray(np.zeros(NUM_VERTICES, np.float32)))
+        self.kernel = Exact(jnp.asarray(np.full((NUM_JOINTS, NUM_VERTICES), 1 / NUM_JOINTS, np.float32)))
+        self.bias = Exact(jnp.asarray(np.zeros(NUM_VERTICES, np.float32)))
 
     def __call__(self, joints: Float[Array, "batch 21 3"]) -> Float[Array, "batch 778 3"]:
         """Return vertices about the point that the joints are about."""
@@ -114,8 +114,8 @@ class ReleaseStart(nnx.Module):
     def __init__(self, config: PoemV1Config, *, rngs: nnx.Rngs) -> None:
         assert isinstance(config.first_stage, RootConfig)
         self.config, self.order, self.mesh = config.first_stage, config.query_order, LinearMesh()
-        self.shift_hidden = linear(NUM_QUERIES, NUM_QUERIES, rngs=rngs)
-        self.shift = linear(NUM_QUERIES, 1, rngs=rngs)
+        self.shift_hidden = linear(NUM_QUERIES, NUM_QUERIES, exact=True, rngs=rngs)
+        self.shift = linear(NUM_QUERIES, 1, exact=True, rngs=rngs)
 
     def __call__(self, seen: ViewFeatures, frame: WorkingFrame) -> Start:
         """Return where the second stage begins; samples with a joint that was not solved mean nothing."""
@@ -141,7 +141,7 @@ class LearnedStart(nnx.Module):
         assert isinstance(config.first_stage, OneStageConfig)
         assert isinstance(config.space, Cuboid)
         self.cuboid, self.origin = config.space, config.first_stage.origin
-        self.points = nnx.Param(uniform(rngs.params(), (NUM_QUERIES, 3)))
+        self.points = Exact(uniform(rngs.params(), (NUM_QUERIES, 3)))
 
     def __call__(self, seen: ViewFeatures, frame: WorkingFrame) -> Start:
         """Return the same for every sample."""

@@ -175,7 +175,7 @@ class Poem(nnx.Module):
             feature_maps, cams, basis, self.config.image_hw, zeros_behind=by_paper
         )
         if by_paper:
-            sampled = sampled + sine_code(uv_share, sampled.shape[-1])
+            sampled = sampled + sine_code(uv_share, sampled.shape[-1]).astype(sampled.dtype)
         return self.aggregation(sampled, cams.view_mask, primary_view(cams.view_mask))
 
     def _move_joints(

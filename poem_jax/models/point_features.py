@@ -13,7 +13,15 @@ from flax import nnx
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.sampling import sample_bilinear
 from poem_jax.models.config import BasisConfig, BasisSampling, Config, Design
-from poem_jax.models.layers import Conv, ConvNorm, NormMode, TopDownBranch, double_bilinear
+from poem_jax.models.layers import (
+    Conv,
+    ConvNorm,
+    NormMode,
+    TopDownBranch,
+    at_least_float32,
+    double_bilinear,
+)
+from poem_jax.models.recompute import TrunkRow
 from poem_jax.typing import Array, Bool, Float
 
 _TEMPERATURE = 10000.0
@@ -57,7 +65,7 @@ def evidence(heat_maps: Float[Array, "image joint h w"]) -> Float[Array, "image 
     return jnp.moveaxis(jnp.log(cells * heat_maps + _MIN_HEAT) * _EVIDENCE_SCALE, -3, -1)
 
 
-class BottomUpBranch(nnx.Module):
+class BottomUpBranch(TrunkRow):
     """From the finest map downwards: convolve with stride 2, add the next coarser map; at the end double the
     resolution once and halve the channels (the release's feature branch)."""
 
@@ -73,7 +81,7 @@ class BottomUpBranch(nnx.Module):
         """Return the map at the second coarsest stride."""
         x = levels[0]
         for reduce, coarser in zip(self.reductions, levels[1:], strict=True):
-            x = reduce(x, mode) + coarser
+            x = self.run(reduce, x, mode) + coarser
         return self.squeeze(double_bilinear(x))
 
 
@@ -155,13 +163,15 @@ class ViewRowColumnCode(nnx.Module):
     ) -> Float[Array, "batch view h w c"]:
         """Return what is added to each view's map; the mix is linear, so each axis is mixed alone."""
         assert self.mix.bias is not None
-        to_view, to_row, to_column = jnp.split(self.mix.kernel[...][0, 0], 3)
+        kernel = self.mix.kernel[...][0, 0]
+        to_view, to_row, to_column = jnp.split(at_least_float32(kernel), 3)
         views, rows, columns = place_codes(view_mask, map_hw, len(to_view), to_view.dtype)
-        return (
+        code = (
             (views @ to_view)[:, :, None, None]
             + (rows @ to_row)[:, None]
             + (columns @ to_column + self.mix.bias[...])
         )
+        return code.astype(kernel.dtype)
 
 
 def place_codes(

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.geometry.neighbours import nearest
-from poem_jax.models.layers import linear
+from poem_jax.models.layers import at_least_float32, linear
 from poem_jax.typing import Array, Bool, Float, Int
 
 _FAR = 1e6
@@ -175,12 +175,14 @@ def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]
 
     @jax.checkpoint  # pyright: ignore[reportPrivateImportUsage]
     def add(sums: _Sums, some: Neighbours) -> _Sums:
-        return _merged(sums, _sums(*jax.vmap(visit)(some)))
+        return _merged(sums, _sums(*map(at_least_float32, jax.vmap(visit)(some))))
 
     logits, values = jax.eval_shape(visit, jax.tree.map(lambda leaf: leaf[0], neighbours))
+    # Sums of half numbers would lose their digits.
+    kept = jnp.promote_types(values.dtype, jnp.float32)
     # Below all logits, so that the first visit counts whole and what was before it not at all.
-    least = jnp.full(logits.shape, jnp.finfo(logits.dtype).min, logits.dtype)
-    nothing = _Sums(least, jnp.zeros_like(least), jnp.zeros(values.shape, values.dtype))
+    least = jnp.full(logits.shape, jnp.finfo(kept).min, kept)
+    nothing = _Sums(least, jnp.zeros_like(least), jnp.zeros(values.shape, kept))
     # In a loop the deltas, which are arguments of the program, would be copied before it starts; but a
     # program of hundreds of steps would take an hour, and all memory, to compile.
     few = neighbours.deltas is not None and len(least) <= _TOGETHER
@@ -188,7 +190,7 @@ def _softmax_sum(visit, neighbours: Neighbours) -> Float[Array, "batch query c"]
     some = jax.tree.map(lambda leaf: leaf.reshape(-1, together, *leaf.shape[1:]), neighbours)
     written_out = few and len(some.index) <= _MOST_STEPS
     sums, _ = jax.lax.scan(lambda sums, some: (add(sums, some), None), nothing, some, unroll=written_out)
-    return sums.numerator / sums.denominator
+    return (sums.numerator / sums.denominator).astype(values.dtype)
 
 
 def _sums(logits: Float[Array, "some batch query c"], values: Float[Array, "some batch query c"]) -> _Sums:

@@ -1,6 +1,6 @@
 """One step of training: a pure function that also runs under `jax.pmap`, `shard_map` and a device mesh."""
 
-from typing import Any
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,19 +11,30 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT, WRIST
 from poem_jax.losses import (
+    WHOLE,
+    Share,
     keypoint_terms,
-    masked_mean,
     match_keypoints,
     multi_view_losses,
     valid_masks,
     weighted,
 )
 from poem_jax.models.network import forward
-from poem_jax.training.config import RootSource, TrainConfig, TrainingRoot
+from poem_jax.models.precision import cast_weights
+from poem_jax.models.recompute import DecoderRow, TrunkRow
+from poem_jax.training.accumulation import Part, add_up, in_parts
+from poem_jax.training.config import Precision, Rematerialise, RootSource, TrainConfig, TrainingRoot
 from poem_jax.training.state import TrainState, learning_rate, make_optimizer, update_average
-from poem_jax.typing import Array, Float, Params, PRNGKeyArray
+from poem_jax.typing import Array, Bool, Float, Params, PRNGKeyArray
 
 Metrics = dict[str, Array]
+
+_RECOMPUTED = {
+    Rematerialise.NOTHING: (),
+    Rematerialise.TRUNK: (TrunkRow,),
+    Rematerialise.DECODER: (DecoderRow,),
+    Rematerialise.BOTH: (TrunkRow, DecoderRow),
+}
 
 
 def train_step(
@@ -47,7 +58,12 @@ def train_step(
         first_stage: train the heat maps alone; the compiler then drops the decoder.
 
     Returns:
-        The next state, and scalar metrics of this step, equal on all devices.
+        The next state, and scalar metrics of this step, equal on all devices. Where `train.skip_bad_steps`
+        allows any, `bad_step` among them is 1 if the loss or the gradient is not finite; the state is then
+        the one before, but for its step.
+
+    Raises:
+        ValueError: the samples cannot be taken in `compute.accumulate` equal parts.
     """
     noise_key, model_key = jax.random.split(jax.random.fold_in(key, state.step))
     draw_key = jax.random.fold_in(model_key, 1) if config.model.grid_draw else None
@@ -60,49 +76,79 @@ def train_step(
         root_world = jnp.where(several[:, None], jnp.nan, root_world)
     if axis_name is not None:
         model_key = jax.random.fold_in(model_key, jax.lax.axis_index(axis_name))
-    cameras = existing_views(batch)
-    hand = HandModel(**state.params["constants"]["hand"])
+    whole = Part(batch, root_world, model_key)
+    loss_share = partial(
+        _loss_share, config=config, draw_key=draw_key, axis_name=axis_name, first_stage=first_stage
+    )
 
-    def loss_share(trainable: Params) -> tuple[Array, Any]:
-        params = {**state.params, "trainable": trainable}
-        prediction, statistics = forward(
-            params,
-            batch.views,
-            cameras,
-            config=config.model,
-            root_world=root_world,
-            train=True,
-            frozen_views=config.frozen_views,
-            key=model_key,
-            draw_key=draw_key,
-            axis_name=axis_name,
-        )
-        image_hw = batch.views.shape[-3:-1]
-        if first_stage:
-            terms = keypoint_terms(
-                prediction, batch, image_hw=image_hw, recipe=config.loss, axis_name=axis_name
-            )
-            loss = weighted(terms, config.loss)
-            errors = keypoint_error(prediction, batch, axis_name=axis_name)
-        else:
-            loss, terms = multi_view_losses(
-                near_the_hand(prediction, batch, config.training_root.max_error_m),
-                batch,
-                hand=hand,
-                image_hw=image_hw,
-                recipe=config.loss,
-                query_order=config.model.query_order,
-                axis_name=axis_name,
-            )
-            errors = error_metrics(prediction, batch, axis_name=axis_name)
-        return loss, ({"loss": loss, **terms, **errors}, statistics)
+    def gradient_of(part: Part, statistics: Params) -> tuple[Params, tuple[Metrics, Params]]:
+        fixed = {**state.params, "statistics": statistics}
+        return jax.grad(loss_share, has_aux=True)(state.params["trainable"], fixed, part)
 
-    gradients, (metrics, statistics) = jax.grad(loss_share, has_aux=True)(state.params["trainable"])
+    statistics = state.params["statistics"]
+    if config.compute.accumulate == 1:
+        gradients, (metrics, statistics) = gradient_of(whole, statistics)
+    else:
+        parts = in_parts(whole, config.compute.accumulate, axis_name)
+        gradients, (metrics, statistics) = add_up(gradient_of, parts, statistics)
     if axis_name is not None:
         gradients, metrics = jax.lax.psum((gradients, metrics), axis_name)
     metrics["gradient_norm"] = optax.tree.norm(gradients)
     metrics["learning_rate"] = jnp.asarray(learning_rate(config)(state.step))
-    return _updated(state, gradients, statistics, config), metrics
+    after = _updated(state, gradients, statistics, config)
+    if config.train.skip_bad_steps:
+        is_finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["gradient_norm"])
+        metrics["bad_step"] = 1.0 - is_finite
+        after = left_out_unless(is_finite, after, state)
+    return after, metrics
+
+
+def _loss_share(
+    trainable: Params,
+    fixed: Params,
+    part: Part,
+    *,
+    config: TrainConfig,
+    draw_key: PRNGKeyArray | None,
+    axis_name: str | None,
+    first_stage: bool,
+) -> tuple[Array, tuple[Metrics, Params]]:
+    """Return this part's share of the loss, its metrics, and the next statistics; `fixed`: the parameters
+    whose trainable ones stand aside."""
+    batch, share = part.batch, Share(axis_name, part.views, part.samples)
+    params = {**fixed, "trainable": trainable}
+    if config.compute.precision is Precision.BFLOAT16:
+        params = cast_weights(params, config.model, jnp.bfloat16)
+    prediction, statistics = forward(
+        params,
+        batch.views,
+        existing_views(batch),
+        config=config.model,
+        root_world=part.root_world,
+        train=True,
+        frozen_views=config.frozen_views,
+        key=part.key,
+        draw_key=draw_key,
+        axis_name=axis_name,
+        recomputed=_RECOMPUTED[config.compute.rematerialise],
+    )
+    image_hw = batch.views.shape[-3:-1]
+    if first_stage:
+        terms = keypoint_terms(prediction, batch, image_hw=image_hw, recipe=config.loss, share=share)
+        loss = weighted(terms, config.loss)
+        errors = keypoint_error(prediction, batch, share=share)
+    else:
+        loss, terms = multi_view_losses(
+            near_the_hand(prediction, batch, config.training_root.max_error_m),
+            batch,
+            hand=HandModel(**fixed["constants"]["hand"]),
+            image_hw=image_hw,
+            recipe=config.loss,
+            query_order=config.model.query_order,
+            share=share,
+        )
+        errors = error_metrics(prediction, batch, share=share)
+    return loss, ({"loss": loss, **terms, **errors}, statistics)
 
 
 def existing_views(batch: MultiViewBatch) -> Cameras:
@@ -145,26 +191,26 @@ def near_the_hand(prediction: Prediction, batch: MultiViewBatch, max_error_m: fl
     return prediction._replace(valid=prediction.valid & near)
 
 
-def error_metrics(prediction: Prediction, batch: MultiViewBatch, *, axis_name: str | None = None) -> Metrics:
-    """Compute the errors a reader of the log understands; shares of the global mean, as in `masked_mean`."""
+def error_metrics(prediction: Prediction, batch: MultiViewBatch, *, share: Share = WHOLE) -> Metrics:
+    """Compute the errors a reader of the log understands, shares of the whole batch's means."""
     _, sample_mask = valid_masks(prediction, batch)
     vertices = _distance(prediction.vertices_world, batch.vertices_world)
     joints = _distance(prediction.joints_world, batch.joints_world)
     return {
-        "mpvpe_mm": 1000.0 * masked_mean(vertices, sample_mask, axis_name=axis_name),
-        "mpjpe_mm": 1000.0 * masked_mean(joints, sample_mask, axis_name=axis_name),
-        **keypoint_error(prediction, batch, axis_name=axis_name),
+        "mpvpe_mm": 1000.0 * share.over_samples(vertices, sample_mask),
+        "mpjpe_mm": 1000.0 * share.over_samples(joints, sample_mask),
+        **keypoint_error(prediction, batch, share=share),
     }
 
 
-def keypoint_error(prediction: Prediction, batch: MultiViewBatch, *, axis_name: str | None = None) -> Metrics:
+def keypoint_error(prediction: Prediction, batch: MultiViewBatch, *, share: Share = WHOLE) -> Metrics:
     """Compute the heat maps' mean error in pixels, a share as in `error_metrics`; nothing without heat
     maps."""
     if prediction.keypoints_px is None:
         return {}
     view_mask, _ = valid_masks(prediction, batch)
     distance = _distance(prediction.keypoints_px, match_keypoints(prediction.keypoints_px, batch))
-    return {"keypoint_px": masked_mean(distance, view_mask, axis_name=axis_name)}
+    return {"keypoint_px": share.over_views(distance, view_mask)}
 
 
 def _distance(a: Array, b: Array) -> Array:
@@ -180,3 +226,9 @@ def _updated(state: TrainState, gradients: Params, statistics: Params, config: T
     if ema is not None:
         ema = update_average(ema, params, state.step, config.optimizer.ema_decay)
     return TrainState(state.step + 1, params, opt_state, ema)
+
+
+def left_out_unless(is_finite: Bool[Array, ""], after: TrainState, before: TrainState) -> TrainState:
+    """Return the state after a step, or the one before with the step counted."""
+    kept = jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), after, before)
+    return kept._replace(step=after.step)
