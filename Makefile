@@ -3,10 +3,12 @@ PYTHON ?= $(firstword $(shell command -v python3.11 python3.12 python3.13 python
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# What `make accelerator` may take, all in all.
+MINUTES ?= 10
 # Two workers: most of the suite is compiling, which keeps one core busy each.
 PYTEST := $(BIN)/python -m pytest -n 2
 
-.PHONY: setup demo test test-browser test-parity test-slow lint bench lock clean
+.PHONY: setup demo test test-browser test-parity test-slow lint bench accelerator lock clean
 .DEFAULT_GOAL := help
 
 help:
@@ -15,6 +17,7 @@ help:
 	@echo "make test    the default test suite (a quarter to half an hour on 2 cores)"
 	@echo "make lint    ruff and pyright"
 	@echo "make bench   print the speed tables of benchmarks/"
+	@echo "make accelerator MINUTES=10   measure a GPU, then train the shipped model on"
 
 setup: $(STAMP)
 
@@ -48,6 +51,9 @@ lint: setup
 
 bench: setup
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+accelerator: setup
+	$(BIN)/python -m tools.accelerator --minutes $(MINUTES)
 
 lock: setup
 	$(BIN)/pip-compile --quiet --strip-extras --no-emit-options --no-emit-index-url --no-emit-find-links --extra dev --extra train --output-file requirements.lock pyproject.toml

@@ -1,0 +1,96 @@
+"""Training on, in a process of its own: `python -m tools.accelerator.going_on RUN SIZE MINUTES`.
+
+It ends after so many minutes or at SIGTERM, with a checkpoint either way, as every run does.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from poem_jax.cli.signals import exit_code, stop_on_signals
+from poem_jax.training.config import TrainConfig
+from tools.accelerator.budget import Budget
+from tools.accelerator.results import Figures
+
+SAVING_S = 25.0
+"""Kept for the last checkpoint and for packing it."""
+_LAST_WORDS_S = 60.0
+"""After the time is up a checkpoint that is being written is waited for, so long."""
+
+
+def train_on(run: Path, size: str, budget: Budget, *, on_cpu: bool) -> int:
+    """Train in the folder `run` for what is left, and wait for the end; return the exit code.
+
+    A signal to this process is passed on, and the checkpoint waited for.
+    """
+    minutes = budget.left(keep=SAVING_S) / 60
+    command = [sys.executable, "-m", "tools.accelerator.going_on", str(run), size, f"{minutes:.3f}"]
+    environment = dict(os.environ, JAX_PLATFORMS="cpu") if on_cpu else dict(os.environ)
+    # Ctrl-C is this process's: the other one would take the signal passed on for a second.
+    process = subprocess.Popen(command, env=environment, start_new_session=True)
+    try:
+        # Starting and compiling take their share before the run's own clock begins.
+        return _waited_for(process, budget.left(keep=SAVING_S))
+    except KeyboardInterrupt:
+        process.send_signal(signal.SIGTERM)
+        _waited_for(process, _LAST_WORDS_S)
+        raise
+
+
+def figures_of(run: Path) -> Figures:
+    """Return what the journal of a run says last of its pace, its loss and its validation."""
+    file = run / "metrics.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    found: Figures = {}
+    for line in lines:
+        found[line["group"]] = {key: value for key, value in line.items() if key != "group"}
+    return found
+
+
+def _waited_for(process: "subprocess.Popen[bytes]", seconds: float) -> int:
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGTERM)
+    try:
+        return process.wait(_LAST_WORDS_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def _train(config: TrainConfig, processes: int) -> None:
+    from poem_jax.training.loop import train
+    from tools.accelerator.captures import drawn_by_processes
+
+    with drawn_by_processes(config.data, processes) as batch_at:
+        train(config, batch_at=batch_at)
+
+
+def main(arguments: list[str]) -> int:
+    """Train the plan of a size."""
+    import logging
+
+    from poem_jax.io.compilation_cache import use_compilation_cache
+    from tools.accelerator.plan import PLANS
+
+    run, size, minutes = arguments
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    use_compilation_cache()
+    config = PLANS[size]().going_on
+    options = replace(config.train, out=run, max_minutes=max(float(minutes), 0.01), progress=False)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        with stop_on_signals():
+            _train(replace(config, train=options), processes=max(cores - 1, 1))
+    except KeyboardInterrupt as request:
+        return exit_code(request)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,50 @@
+"""What measures: `python -m tools.accelerator.worker`, rows on stdin, their figures on stdout.
+
+It ends when its stdin does. What libraries print goes to stderr. A row that does not fit into memory is an
+answer; whatever else goes wrong ends the process, and says so on stderr.
+"""
+
+import os
+import signal
+import sys
+from typing import IO
+
+from poem_jax.mixture.wire import Failure, receive, send
+from tools.accelerator.results import Figures
+from tools.accelerator.rows import Row
+
+
+def serve(requests: IO[bytes], replies: IO[bytes]) -> None:
+    """Answer every row with its figures, or with a `Failure`, until the pipe ends."""
+    try:
+        while True:
+            send(replies, _answer(receive(requests)))
+    except (EOFError, BrokenPipeError):
+        return
+
+
+def _answer(row: Row) -> Figures | Failure:
+    import jax
+
+    try:
+        return row.measure()
+    except jax.errors.JaxRuntimeError as error:
+        # Mostly memory: XLA's words are long, and their first line says what was asked for.
+        return Failure(RuntimeError(str(error).strip().splitlines()[0][:300]))
+    finally:
+        jax.clear_caches()
+
+
+def main() -> None:
+    """Serve stdin and stdout; Ctrl-C is the parent's."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    from poem_jax.io.compilation_cache import use_compilation_cache
+
+    use_compilation_cache()
+    serve(sys.stdin.buffer, replies)
+
+
+if __name__ == "__main__":
+    main()
