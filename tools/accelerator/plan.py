@@ -97,10 +97,10 @@ def micro_plan() -> Plan:
         ),
     )
     rows = (
-        Inference("micro", model, HALF, 2, 2, about_s=5),
-        Training("micro", experiment, HALF, 2, about_s=5),
-        Inference("micro", model, HALF, 2, 1, packed=True, about_s=5),
-        Fitting(frames=4, views=2, about_s=5),
+        Inference("micro", model, HALF, 2, 2, about_s=60),
+        Training("micro", experiment, HALF, 2, about_s=60),
+        Inference("micro", model, HALF, 2, 1, packed=True, about_s=60),
+        Fitting(frames=4, views=2, about_s=60),
     )
     return Plan(Machine(256), rows, experiment)
 
