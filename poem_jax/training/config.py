@@ -273,6 +273,17 @@ class TrainConfig:
             all(size % devices == 0 for size in sizes),
             f"every `batch_size` must be a multiple of `train.host_devices` = {devices}; got {sizes}",
         )
+        parts = self.compute.accumulate
+        require(
+            all(size % (devices * parts) == 0 for size in sizes),
+            "every `batch_size` must be a multiple of `train.host_devices` times `compute.accumulate` = "
+            f"{devices} x {parts}; got {sizes}",
+        )
+        require(
+            parts == 1 or not self.model.couples_samples,
+            f"`compute.accumulate` must be 1 for this {type(self.model).__name__}, whose samples depend on "
+            f"each other; got {parts}",
+        )
         require(
             tuple(data.image_hw) == tuple(self.model.image_hw),
             f"`data.synthetic.image_hw` must be the model's {self.model.image_hw}; got {data.image_hw}",
