@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,8 @@ import pytest
 
 from poem_jax.training.source import synthetic_batches
 from tests.accelerator_rows import Ending, Planted
-from tools.accelerator import parts, readme
-from tools.accelerator.__main__ import _measure, main
+from tools.accelerator import going_on, parts, readme
+from tools.accelerator.__main__ import _measure
 from tools.accelerator.budget import Budget
 from tools.accelerator.captures import drawn_by_processes
 from tools.accelerator.flops import count_flops
@@ -161,9 +162,8 @@ def test_the_plan_asks_for_all_that_the_readme_promises():
     assert {row.model_name for row in rows if isinstance(row, Training)} == {"v2-base", "tiny"}
     assert len({row.name for row in rows}) == len(rows)
     # The most valuable first: what has a goal.
-    assert [type(row) for row in rows[:2]] == [Inference, Training]
-    going_on = whole_plan().going_on
-    assert going_on.train.init_from == "shipped"
+    assert {type(row) for row in rows[:3]} == {Inference, Training}
+    assert whole_plan().going_on.train.init_from == "shipped"
     assert set(PLANS) == {"whole", "micro"}
 
 
@@ -197,32 +197,70 @@ def test_the_readme_has_the_place_for_the_table(tmp_path):
     assert "<!-- accelerator -->\nnew\n<!-- /accelerator -->" in file.read_text()
 
 
-@pytest.mark.slow
-def test_a_sitting_measures_trains_and_goes_on_elsewhere(tmp_path, capfd):
-    """All of it on a CPU at its smallest: once, again from the parts alone, and stopped by a signal."""
-    page = tmp_path / "page.md"
-    page.write_text(f"{readme.BEGIN}{readme.END}")
-    where = ["--out", str(tmp_path / "out"), "--run", str(tmp_path / "run"), "--readme", str(page)]
-    command = ["--device", "cpu", "--size", "micro", *where]
-    assert main([*command, "--minutes", "1.6"]) == 0
-    stored = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert [row for row in stored["rows"].values() if "problem" in row] == []
-    assert "| not measured |" in page.read_text()
-    first = stored["going_on"]["train"]["step"]
-    (tmp_path / "run").rename(tmp_path / "lost")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    again = subprocess.Popen(
-        [sys.executable, "-m", "tools.accelerator", *command, "--minutes", "1.2"],
-        env=environment,
+@pytest.mark.parametrize(
+    ("ending", "code"), [("sys.exit(7)", 7), ("time.sleep(60)", -signal.SIGKILL)], ids=["ends", "goes on"]
+)
+def test_a_training_whose_time_is_up_may_save_and_is_ended_then(monkeypatch, ending, code):
+    monkeypatch.setattr(going_on, "_LAST_WORDS_S", 1.0)
+    saves = f"import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: {ending})"
+    command = [sys.executable, "-c", f"{saves}; print(flush=True); [time.sleep(1) for _ in range(60)]"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert going_on._waited_for(process, 0.1) == code
+
+
+def sitting(tmp_path: Path, until_step: int) -> str:
+    """Start the command at its smallest, stop it by a signal once its training has got so far, and return
+    what it said; there is more time than it needs."""
+    where = [
+        "--out",
+        str(tmp_path / "out"),
+        "--run",
+        str(tmp_path / "run"),
+        "--readme",
+        str(tmp_path / "page.md"),
+    ]
+    size = ["--device", "cpu", "--size", "micro", "--minutes", "120"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "tools.accelerator", *size, *where],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         text=True,
         cwd=ROOT,
-    )
-    assert again.stdout is not None
-    for line in again.stdout:
-        if "goes on in" in line:
-            break
-    again.send_signal(signal.SIGTERM)
-    assert again.wait(120) == 128 + signal.SIGTERM
-    after = json.loads((tmp_path / "out" / "results.json").read_text())["going_on"]["train"]["step"]
-    assert after >= first
+    ) as process:
+        while (
+            process.poll() is None
+            and going_on.figures_of(tmp_path / "run").get("train", STEP_0)["step"] < until_step
+        ):
+            time.sleep(0.2)
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout is not None
+        said = process.stdout.read()
+        assert process.wait(600) == 128 + signal.SIGTERM, said
+    return said
+
+
+STEP_0 = {"step": 0}
+
+
+@pytest.mark.slow
+def test_what_is_measured_and_trained_goes_on_elsewhere(tmp_path):
+    """Rows once, and the training from the parts alone where its folder is lost."""
+    (tmp_path / "page.md").write_text(f"{readme.BEGIN}{readme.END}")
+    sitting(tmp_path, until_step=4)
+    stored = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [row["problem"] for row in stored["rows"].values() if "problem" in row] == []
+    assert "| not measured |" in (tmp_path / "page.md").read_text()
+    reached = stored["going_on"]["train"]["step"]
+    assert reached >= 4
+    (tmp_path / "run").rename(tmp_path / "lost")
+    said = sitting(tmp_path, until_step=reached + 2)
+    assert said.count("measured before") == len(stored["rows"])
+    assert "goes on in" in said
+    again = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert again["rows"] == stored["rows"]
+    assert again["going_on"]["train"]["step"] >= reached + 2
+    lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    steps = [line["step"] for line in map(json.loads, lines) if line["group"] == "train"]
+    assert steps == sorted(set(steps))

@@ -31,14 +31,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.accelerator", description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0, help="all of it: starting, compiling, saving")
     parser.add_argument("--out", type=Path, default=Path("out/accelerator"), help="results and parts")
-    parser.add_argument("--run", type=Path, default=Path("runs/accelerator"), help="the run that goes on")
+    parser.add_argument("--run", type=Path, help="the run that goes on; tiny_accelerator's")
     parser.add_argument("--device", choices=("gpu", "cpu"), default="gpu")
     parser.add_argument("--size", choices=tuple(PLANS), default="whole", help="micro: does it run?")
     parser.add_argument("--readme", type=Path, help="file whose table is rewritten; README.md for a GPU")
     given = parser.parse_args(arguments)
+    plan = PLANS[given.size]()
+    given.run = given.run or Path(plan.going_on.train.out)
     try:
         with stop_on_signals():
-            return _run(given, Budget(given.minutes))
+            return _run(given, plan, Budget(given.minutes))
     except KeyboardInterrupt as request:
         print(f"stopped; {given.out} has the rows so far, {given.run} the run. The same command goes on")
         return exit_code(request)
@@ -47,8 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
 
 
-def _run(given: argparse.Namespace, budget: Budget) -> int:
-    plan, results = PLANS[given.size](), Results(given.out)
+def _run(given: argparse.Namespace, plan: Plan, budget: Budget) -> int:
+    results = Results(given.out)
     on_cpu = given.device == "cpu"
     with Measurer(on_cpu=on_cpu) as measurer:
         results.use_machine(_machine(measurer, plan, budget, on_cpu=on_cpu))
@@ -104,7 +106,7 @@ def _go_on(given: argparse.Namespace, results: Results, budget: Budget, *, on_cp
     try:
         code = train_on(given.run, given.size, budget, on_cpu=on_cpu)
     finally:
-        if (given.run / "checkpoints").is_dir():
+        if _has_checkpoint(given.run):
             files = parts.pack(given.run, packed)
             results.going_on = figures_of(given.run)
             results.write()
@@ -113,6 +115,10 @@ def _go_on(given: argparse.Namespace, results: Results, budget: Budget, *, on_cp
         return 0
     print(f"error: the training ended with {code}; its words are above", file=sys.stderr)
     return 1
+
+
+def _has_checkpoint(run: Path) -> bool:
+    return any(folder.name.isdigit() for folder in (run / "checkpoints").glob("*"))
 
 
 def _what_is_missing(machine: Figures) -> str:

@@ -11,15 +11,17 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from poem_jax.cli.messages import set_up_logging
 from poem_jax.cli.signals import exit_code, stop_on_signals
 from poem_jax.training.config import TrainConfig
 from tools.accelerator.budget import Budget
 from tools.accelerator.results import Figures
 
-SAVING_S = 25.0
-"""Kept for the last checkpoint and for packing it."""
-_LAST_WORDS_S = 60.0
-"""After the time is up a checkpoint that is being written is waited for, so long."""
+_LAST_WORDS_S = 30.0
+"""For the step under way and its checkpoint when the time is up; then the process is killed, and the
+checkpoint before stands."""
+SAVING_S = _LAST_WORDS_S + 10.0
+"""Kept for that and for packing the run."""
 
 
 def train_on(run: Path, size: str, budget: Budget, *, on_cpu: bool) -> int:
@@ -73,13 +75,11 @@ def _train(config: TrainConfig, processes: int) -> None:
 
 def main(arguments: list[str]) -> int:
     """Train the plan of a size."""
-    import logging
-
     from poem_jax.io.compilation_cache import use_compilation_cache
     from tools.accelerator.plan import PLANS
 
     run, size, minutes = arguments
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    set_up_logging()
     use_compilation_cache()
     config = PLANS[size]().going_on
     options = replace(config.train, out=run, max_minutes=max(float(minutes), 0.01), progress=False)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from poem_jax.experiments.tiny_continued import config as tiny_continued
+from poem_jax.experiments.tiny_accelerator import config as tiny_accelerator
 from poem_jax.experiments.tiny_synthetic import config as tiny_synthetic
 from poem_jax.experiments.v2_base_synthetic import config as v2_base_synthetic
 from poem_jax.models.config import (
@@ -63,7 +63,7 @@ def whole_plan() -> Plan:
         *[row for precision in (HALF, FULL) for views in (4, 1) for row in inference(precision, views, 8)],
         Fitting(frames=5000),
     ]
-    return Plan(Machine(8192), tuple(rows), continued())
+    return Plan(Machine(8192), tuple(rows), tiny_accelerator)
 
 
 def micro_plan() -> Plan:
@@ -79,7 +79,7 @@ def micro_plan() -> Plan:
         decoder=DecoderConfig(num_layers=1, num_neighbours=4, num_heads=2, ffn_expansion=1),
     )
     experiment = replace(
-        tiny_continued,
+        tiny_accelerator,
         name="micro",
         model=model,
         data=DataConfig(
@@ -87,7 +87,8 @@ def micro_plan() -> Plan:
             batches=(BatchShape(num_views=2, batch_size=2, min_views=1),),
         ),
         train=replace(
-            tiny_continued.train,
+            tiny_accelerator.train,
+            out="runs/micro_accelerator",
             init_from=None,
             steps=10_000,
             checkpoint_every=100,
@@ -97,37 +98,15 @@ def micro_plan() -> Plan:
         ),
     )
     rows = (
-        Inference("micro", model, HALF, 2, 2, about_s=60),
-        Training("micro", experiment, HALF, 2, about_s=60),
-        Inference("micro", model, HALF, 2, 1, packed=True, about_s=60),
-        Fitting(frames=4, views=2, about_s=60),
+        Inference("micro", model, HALF, 2, 2, about_s=_PATIENT_S),
+        Training("micro", experiment, HALF, 2, about_s=_PATIENT_S),
+        Inference("micro", model, HALF, 2, 1, packed=True, about_s=_PATIENT_S),
+        Fitting(frames=4, views=2, about_s=_PATIENT_S),
     )
     return Plan(Machine(256), rows, experiment)
 
 
-def continued() -> TrainConfig:
-    """Return `tiny_continued` in batches that fill a GPU: as many samples in all, the rate of the last
-    sitting on one (docs/shipped_model.md)."""
-    batches = tuple(replace(b, batch_size=_TIMES * b.batch_size) for b in tiny_continued.data.batches)
-    return replace(
-        tiny_continued,
-        name="tiny_accelerator",
-        data=replace(tiny_continued.data, batches=batches, prefetch=6, workers=3),
-        optimizer=replace(tiny_continued.optimizer, learning_rate=3e-4),
-        train=replace(
-            tiny_continued.train,
-            steps=tiny_continued.train.steps // _TIMES,
-            log_every=10,
-            checkpoint_every=200,
-            keep_checkpoints=1,
-            validate_every=500,
-            host_devices=1,
-        ),
-    )
-
-
-_TIMES = 8
-"""Batches of 128 captures instead of 16."""
-
+_PATIENT_S = 300.0
+"""For a row of a few seconds, on cores that may be busy otherwise."""
 PLANS: dict[str, Callable[[], Plan]] = {"whole": whole_plan, "micro": micro_plan}
 """By the name of their size."""
