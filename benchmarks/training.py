@@ -1,97 +1,185 @@
-"""How fast is a training step? `python benchmarks/training.py [--preset NAME ...] [--rounds N]`.
+"""How fast is a training step, and what memory does it take? `python benchmarks/training.py [--only ROW]`.
 
-One whole step (value, gradients, Adam) as `poem train` takes it on a CPU, on a batch of synthetic captures:
-with kernels' gradients by minimal filtering (`poem_jax/models/winograd.py`), and with XLA's own everywhere.
-Both programs run in one process by turns, with the allocator settings of the `poem` command and two host
-devices; figures are medians. The first step of each, which compiles, does not count.
+    gradients   kernels' gradients by minimal filtering (`poem_jax/models/winograd.py`), and XLA's own
+    compute     the shipped recipe's step in half numbers, with insides computed again, in parts
+    memory      of a `v2-base` step at 1 x 8 views, with insides kept and computed again
+    data        share of the shipped recipe's time that waits for captures drawn beside it
+    scaling     devices and processes with a fixed share each, against one device with all of it
+
+One whole step (value, gradients, Adam) as `poem train` takes it on a CPU, on batches of synthetic captures,
+in a process with the allocator settings of the `poem` command. What is compared runs by turns in one process;
+figures are medians, and steps that compile do not count. `--thin` takes models of a few channels, to see that
+all rows run. `--resident` runs the `memory` row's steps, too, for what the process really takes; those of
+`v2-base` take minutes.
 """
 
 import argparse
 import json
 import os
-import statistics
+import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import replace
-from unittest import mock
+from typing import Any
 
 from poem_jax.io.allocator import SETTINGS
 
-BATCHES = {"tiny": (16, 4), "v1": (2, 8)}
+GRADIENTS = {"tiny": (16, 4), "v1": (2, 8)}
 """Samples and views a step: a quarter of the shipped model's batch, an eighth of POEM v1's (ResNet-34 at
 256 px), which are as large as measures a step well."""
+SHIPPED, SHIPPED_BATCH = "tiny_continued", (16, 4)
+DEVICES, SAMPLES_EACH = (1, 2, 4, 8), 4
+PROCESSES = 2
 
 
 def main() -> None:
-    """Print a row for each preset, or time one where `--job` is given."""
+    """Print the tables that are asked for, or do one `--job`."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--preset", action="append", choices=BATCHES, help="repeatable; without it both")
+    parser.add_argument("--only", action="append", choices=ROWS, help="repeatable; without it all")
+    parser.add_argument("--preset", action="append", choices=GRADIENTS, help="of `gradients`; else both")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--job", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--thin", action="store_true")
+    parser.add_argument("--resident", action="store_true")
+    parser.add_argument("--job", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.job:
-        print(json.dumps(_time(given.preset[0], given.rounds)))
+        from training_jobs.jobs import JOBS
+
+        name, options = given.job
+        print(json.dumps(JOBS[name](**json.loads(options))))
         return
+    for name in given.only or ROWS:
+        ROWS[name](given)
+
+
+def gradients(given: argparse.Namespace) -> None:
+    """Compare two gradients of kernels."""
     print("| preset | samples x views | XLA's gradients, s | minimal filtering, s | ratio |")
     print("|---|---|---|---|---|")
-    for name in given.preset or BATCHES:
-        command = [sys.executable, __file__, "--job", "--preset", name, "--rounds", str(given.rounds)]
-        flags = "--xla_force_host_platform_device_count=2"
-        environment = {**os.environ, "GLIBC_TUNABLES": SETTINGS, "XLA_FLAGS": flags}
-        done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
-        plain, filtered = json.loads(done.stdout.splitlines()[-1])
-        samples, views = BATCHES[name]
-        row = f"| `{name}` | {samples} x {views} | {plain:.2f} | {filtered:.2f} | {plain / filtered:.2f} |"
+    for preset in given.preset or GRADIENTS:
+        samples, views = GRADIENTS[preset]
+        batch = {"samples": samples, "views": views, "rounds": given.rounds, "thin": given.thin}
+        plain, filtered = _do("time_gradients", 2, name=f"{preset}_synthetic", **batch)
+        row = f"| `{preset}` | {samples} x {views} | {plain:.2f} | {filtered:.2f} | {plain / filtered:.2f} |"
         print(row, flush=True)
 
 
-def _time(name: str, rounds: int) -> tuple[float, float]:
-    from poem_jax.models import layers
+def compute(given: argparse.Namespace) -> None:
+    """Compare ways to compute the shipped recipe's step."""
+    samples, views = SHIPPED_BATCH
+    forms = [
+        "float32",
+        "bfloat16",
+        "float32, trunk again",
+        "float32, decoder again",
+        "float32, both again",
+        "bfloat16, both again",
+        "float32, 4 parts",
+    ]
+    found = _do(
+        "time_compute",
+        2,
+        name=SHIPPED,
+        samples=samples,
+        views=views,
+        rounds=given.rounds,
+        thin=given.thin,
+        forms=forms,
+    )
+    print(f"| `{SHIPPED}`, {samples} x {views} | samples/s | times float32 | first loss |")
+    print("|---|---|---|---|")
+    first = found[forms[0]][0]
+    for form, (seconds, loss) in found.items():
+        print(f"| {form} | {samples / seconds:.2f} | {first / seconds:.2f} | {loss:.5f} |", flush=True)
 
-    with mock.patch.object(layers, "_filters_gradients", return_value=False):
-        plain = _steps(name)
-        plain()
-    filtered = _steps(name)
-    filtered()
-    forms = (plain, filtered)
-    seconds: tuple[list[float], list[float]] = ([], [])
-    for _ in range(rounds):
-        for form, times in zip(forms, seconds, strict=True):
-            start = time.perf_counter()
-            form()
-            times.append(time.perf_counter() - start)
-    return statistics.median(seconds[0]), statistics.median(seconds[1])
+
+def memory(given: argparse.Namespace) -> None:
+    """Compare what steps need."""
+    real = " peak of the process, GB | step, s |" if given.resident else ""
+    print(f"| `v2-base`, 1 x 8 | beside state and batch, GB | state and batch, GB |{real}")
+    print("|---|---|---|" + 2 * "---|" * given.resident)
+    options = {"name": "v2_base_synthetic", "samples": 1, "views": 8}
+    for form in (
+        "float32",
+        "float32, trunk again",
+        "float32, both again",
+        "bfloat16",
+        "bfloat16, both again",
+    ):
+        found = _do("measure_memory", 1, **options, thin=given.thin, form=form, resident=given.resident)
+        real = f" {found['peak']:.2f} | {found['seconds']:.1f} |" if given.resident else ""
+        print(f"| {form} | {found['temporary']:.2f} | {found['arguments']:.2f} |{real}", flush=True)
 
 
-def _steps(name: str) -> Callable[[], None]:
-    """Return what takes one more step of an experiment."""
-    import jax
+def data(given: argparse.Namespace) -> None:
+    """Measure what waits for captures."""
+    found = _do("measure_wait", 2, name=SHIPPED, steps=4 * given.rounds, thin=given.thin)
+    print(f"| `{SHIPPED}`, its own batches | waiting for data, % | samples/s |\n|---|---|---|")
+    print(f"| {4 * given.rounds} steps | {100 * found['share']:.1f} | {found['rate']:.2f} |", flush=True)
 
-    from poem_jax.experiments import open_experiment
-    from poem_jax.models.apply import init
-    from poem_jax.training.config import BatchShape
-    from poem_jax.training.parallel import compile_step, data_mesh, put_batch, replicated
-    from poem_jax.training.source import synthetic_batches
-    from poem_jax.training.state import create_state
 
-    samples, views = BATCHES[name]
-    config = open_experiment(f"{name}_synthetic")
-    data = replace(config.data, batches=(BatchShape(num_views=views, batch_size=samples),))
-    config, mesh, key = replace(config, data=data), data_mesh(), jax.random.key(0)
-    batch = put_batch(synthetic_batches(config.data)(0), mesh)
-    step = compile_step(config, mesh)
-    state = jax.device_put(create_state(init(config.model, key=key), config), replicated(mesh))
+def scaling(given: argparse.Namespace) -> None:
+    """Give every device the same share, and compare with one device that has all."""
+    print("| devices | samples | step, s | one device, s | overhead, % | largest difference of a loss |")
+    print("|---|---|---|---|---|---|")
+    options = {"name": SHIPPED, "views": SHIPPED_BATCH[1], "rounds": given.rounds, "thin": given.thin}
+    losses: dict[int, list[float]] = {}
+    seconds: dict[int, float] = {}
+    for count in DEVICES:
+        samples = SAMPLES_EACH * count
+        found = _do("time_scaling", count, **options, samples=samples, alone=True)
+        (split, losses[count]), (taken, seconds[count]) = found["losses"], found["seconds"]
+        _print_scaling(f"{count}", samples, taken, seconds[count], split, losses[count])
+    samples = SAMPLES_EACH * PROCESSES
+    found = _do_in_processes(**options, samples=samples)
+    ours, taken = found["losses"][0], found["seconds"][0]
+    _print_scaling(f"{PROCESSES} processes of 1", samples, taken, seconds[PROCESSES], ours, losses[PROCESSES])
 
-    def go() -> None:
-        nonlocal state
-        state, _ = step(state, batch, key)
-        jax.block_until_ready(state)
 
-    return go
+def _print_scaling(
+    what: str, samples: int, taken: float, alone: float, split: list[float], whole: list[float]
+) -> None:
+    apart = max(abs(a / b - 1) for a, b in zip(split, whole, strict=True))
+    overhead = 100 * (taken / alone - 1)
+    print(f"| {what} | {samples} | {taken:.2f} | {alone:.2f} | {overhead:.0f} | {apart:.1e} |", flush=True)
+
+
+ROWS: dict[str, Callable[[argparse.Namespace], None]] = {
+    row.__name__: row for row in (gradients, compute, memory, data, scaling)
+}
+
+
+def _do(job: str, devices: int, **options: Any) -> Any:
+    """Do a job in a process of its own, and return what it found."""
+    return _result(_start(job, devices, options))
+
+
+def _do_in_processes(**options: Any) -> Any:
+    """Do the scaling job in several processes of one device each."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        hosts = {"coordinator": f"localhost:{free.getsockname()[1]}", "count": PROCESSES}
+    running = [
+        _start("time_scaling_of_hosts", 1, {**options, **hosts, "index": index}) for index in range(PROCESSES)
+    ]
+    first, *_ = (_result(process) for process in running)
+    return first
+
+
+def _start(job: str, devices: int, options: dict[str, Any]) -> "subprocess.Popen[str]":
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    environment = {**os.environ, "GLIBC_TUNABLES": SETTINGS, "XLA_FLAGS": flags}
+    command = [sys.executable, __file__, "--job", job, json.dumps(options)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def _result(process: "subprocess.Popen[str]") -> Any:
+    out, _ = process.communicate()
+    if process.returncode:
+        raise SystemExit(f"a job ended with status {process.returncode}; its own output says why")
+    return json.loads(out.splitlines()[-1])
 
 
 if __name__ == "__main__":
