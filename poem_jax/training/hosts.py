@@ -3,8 +3,12 @@
 All of it is `jax.distributed`. Where there is one process, nothing here waits or talks to anybody.
 """
 
+import hashlib
+import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -17,8 +21,10 @@ START_TIMEOUT_S = 300
 END_TIMEOUT_S = 20
 """How long a host that ends waits for the others to end too."""
 
+_NETWORK_DISK_S = 10
 
-class HostLost(RuntimeError):
+
+class HostLost(ConnectionError):
     """Another host of the run has ended, so that this one cannot go on."""
 
 
@@ -33,7 +39,8 @@ def start_hosts(coordinator: str | None, count: int | None, index: int | None) -
     Raises:
         ValueError: some of the three are given and some are not, they make no sense, or nothing is given and
             JAX finds no launcher.
-        RuntimeError: the hosts have not found each other, or JAX has been used before.
+        ConnectionError: the hosts have not found each other.
+        RuntimeError: JAX has been used before.
     """
     given = {"--coordinator": coordinator, "--num-hosts": count, "--host-index": index}
     missing = [name for name, value in given.items() if value is None]
@@ -56,7 +63,7 @@ def start_hosts(coordinator: str | None, count: int | None, index: int | None) -
             "processes with one of these, or name them: --coordinator HOST:PORT --num-hosts N --host-index I"
         ) from error
     except jax.errors.JaxRuntimeError as error:
-        raise RuntimeError(
+        raise ConnectionError(
             f"host {index} of {count} has not found the others at {coordinator}: {_first_line(error)}. Start "
             "all of them within 5 minutes, each with its own --host-index; the port must be free on the "
             "first host, and open to the others"
@@ -98,6 +105,58 @@ def wait_for_all(name: str) -> None:
         return
     with names_lost_host():
         multihost_utils.sync_global_devices(name)
+
+
+def check_same_everywhere(what: str, text: str) -> None:
+    """Insist that all hosts have the same `text`, their config, say.
+
+    Raises:
+        ValueError: on all of them, if one has another; names `what` and which hosts.
+        HostLost: another host has ended.
+    """
+    if jax.process_count() == 1:
+        return
+    own = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
+    with names_lost_host():
+        of_hosts = multihost_utils.process_allgather(own)
+    others = [host for host, digest in enumerate(of_hosts) if not np.array_equal(digest, of_hosts[0])]
+    if others:
+        raise ValueError(
+            f"all hosts must have the same {what}; hosts {others} have another than the first one"
+        )
+
+
+def check_shared_folder(folder: Path, option: str) -> None:
+    """Insist that this folder is one and the same on all hosts, and leave nothing in it.
+
+    Raises:
+        ValueError: on all hosts, if one does not see what the first one writes; names the `option`.
+        HostLost: another host has ended.
+    """
+    if jax.process_count() == 1:
+        return
+    file = folder / ".seen_by_all_hosts"
+    if is_first_host():
+        file.touch()
+    wait_for_all("the first host has written")
+    lonely = any_host(not _appears(file))
+    if is_first_host():
+        file.unlink(missing_ok=True)
+    if lonely:
+        raise ValueError(
+            f"all hosts write to one folder, but {folder} is not the same on all of them; give an {option} "
+            "on a disk that they share"
+        )
+
+
+def _appears(file: Path) -> bool:
+    """Look for a file that another host has just written: network disks take seconds to show it."""
+    end = time.monotonic() + _NETWORK_DISK_S
+    while file.name not in os.listdir(file.parent):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.2)
+    return True
 
 
 @contextmanager

@@ -3,7 +3,8 @@
 import importlib.util
 
 from poem_jax.io.writable import check_folder_is_writable
-from poem_jax.training.config import TrainConfig, git_commit
+from poem_jax.training.config import TrainConfig, config_json, git_commit
+from poem_jax.training.hosts import check_same_everywhere
 
 
 def check_before_training(config: TrainConfig) -> None:
@@ -12,7 +13,7 @@ def check_before_training(config: TrainConfig) -> None:
     Raises:
         ModuleNotFoundError: an extra that the run needs is not installed; says how to get it.
         ValueError: the run directory cannot be written to, or the working tree has changes and
-            `train.require_clean_commit` is on.
+            `train.require_clean_commit` is on; or hosts differ in config or commit.
     """
     if importlib.util.find_spec("grain") is None:
         raise ModuleNotFoundError("training needs Grain: pip install 'poem-jax[train]'")
@@ -23,3 +24,5 @@ def check_before_training(config: TrainConfig) -> None:
     check_folder_is_writable(config.train.out, "--train.out")
     if config.train.require_clean_commit and git_commit().endswith(("+changes", "unknown")):
         raise ValueError("`train.require_clean_commit` is on, but the working tree has uncommitted changes")
+    check_same_everywhere("config", config_json(config))
+    check_same_everywhere("commit of the code", git_commit())
