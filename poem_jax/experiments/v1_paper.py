@@ -11,10 +11,10 @@ Data:      the authors' tars in data/dataset_tars/ (poem_jax/experiments/parts/d
 Hardware:  accelerators; what must stay on one is refused before the first step.
 Time:      the paper does not say; not measured here. 158,600 steps on DexYCB, 56,700 on HO3D, 366,800 on
            OakInk.
-Expected:  the paper's MPVPE in mm, tables of the main experiments and of the ablations, DexYCB / OakInk /
-           HO3D: v1 6.13 / 6.20 / 17.20, mvp 9.77 / 9.69 / 20.95, pe-meshtr 7.41 / 8.34 / 23.49, ftl-meshtr 8.75 /
-           9.28 / 24.15, v1-1stage 9.42 / - / -, v1-wo-proj 6.57 / 6.42 / 18.83, v1-wo-pt 7.63 / - / 19.26,
-           v1-g-emb - / 6.25 / -, v1-gv-emb - / 6.23 / -. No number of ours yet.
+Expected:  the paper's MPVPE in mm, tables of the main experiments and of the ablations, on DexYCB, OakInk and
+           HO3D: v1 6.13, 6.20, 17.20; mvp 9.77, 9.69, 20.95; pe-meshtr 7.41, 8.34, 23.49; ftl-meshtr 8.75,
+           9.28, 24.15; v1-wo-proj 6.57, 6.42, 18.83; v1-1stage 9.42 on DexYCB; v1-wo-pt 7.63 on DexYCB, 19.26
+           on HO3D; v1-g-emb 6.25 and v1-gv-emb 6.23 on OakInk. No number of ours yet.
 Command:   poem train v1_paper
            is v1 on DexYCB; poem train v1_paper:mvp-ho3d another.
 """
