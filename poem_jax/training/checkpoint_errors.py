@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from poem_jax.training.hosts import any_host
+from poem_jax.training.hosts import HostLost, any_host, names_lost_host
 
 
 class CheckpointNotWritten(OSError):
@@ -16,7 +16,10 @@ class CheckpointNotWritten(OSError):
 def names_failed_write(step: int | None, folder: Path) -> Iterator[None]:
     """Turn whatever a writer says into a `CheckpointNotWritten` that says what is left."""
     try:
-        yield
+        with names_lost_host():
+            yield
+    except HostLost:
+        raise
     except Exception as error:
         # Orbax and TensorStore raise many kinds, some for the same full disk.
         usage = shutil.disk_usage(folder)

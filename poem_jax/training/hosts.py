@@ -4,6 +4,7 @@ All of it is `jax.distributed`. Where there is one process, nothing here waits o
 """
 
 import hashlib
+import logging
 import os
 import time
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ END_TIMEOUT_S = 20
 """How long a host that ends waits for the others to end too."""
 
 _NETWORK_DISK_S = 10
+_log = logging.getLogger(__name__)
 
 
 class HostLost(ConnectionError):
@@ -167,11 +169,14 @@ def names_lost_host() -> Iterator[None]:
     except jax.errors.JaxRuntimeError as error:
         if jax.process_count() == 1 or not any(word in str(error) for word in _LOST):
             raise
-        raise HostLost(
+        message = (
             f"host {jax.process_index()} of {jax.process_count()} cannot go on: another host has ended or "
             f"cannot be reached ({_first_line(error)}). Its own output says why; start all hosts again, and "
             "training goes on from the newest checkpoint"
-        ) from error
+        )
+        # Now, since JAX may end this process while it still waits for a write that the other takes part in.
+        _log.error("%s", message)
+        raise HostLost(message) from error
 
 
 _LOST = (

@@ -1,6 +1,11 @@
 """Checkpoints of a run: with checksums as soon as they are whole, and never trusted where they are not."""
 
+import resource
 import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -8,13 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.training.checkpoint_errors import CheckpointNotWritten
 from poem_jax.training.checkpoints import Checkpoints
-from poem_jax.training.state import TrainState, create_state
+from poem_jax.training.parallel import data_mesh, put_everywhere
+from poem_jax.training.state import TrainState
+
+
+def state_of(size: int) -> TrainState:
+    """A state with as many weights, which no two bytes of a file can stand for."""
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=size), jnp.float32)
+    return TrainState(jnp.zeros((), jnp.int32), {"trainable": {"weights": weights}}, (), None)
 
 
 @pytest.fixture
-def state(micro_params, micro_config) -> TrainState:
-    return create_state(micro_params, micro_config)
+def state() -> TrainState:
+    return state_of(100)
 
 
 def at_step(state: TrainState, step: int) -> TrainState:
@@ -113,3 +126,104 @@ def test_when_none_can_be_read_all_are_named(micro_config, state, run_dir):
 def test_an_empty_run_has_no_checkpoint(micro_config, state):
     with pytest.raises(FileNotFoundError, match="no checkpoint in"):
         restore(micro_config, state)
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", [cut, flip, Path.unlink])
+def test_whichever_file_is_damaged_the_run_goes_on_and_writes_that_step_again(
+    micro_config, state, run_dir, tmp_path, damage: Callable[[Path], None]
+):
+    whole = run_dir.rename(tmp_path / "whole")
+    files = [file.relative_to(whole) for file in (whole / "checkpoints" / "4").rglob("*") if file.is_file()]
+    assert len(files) > 5
+    for file in files:
+        if not (whole / file).stat().st_size:
+            continue
+        shutil.copytree(whole, run_dir)
+        damage(run_dir / file)
+        with Checkpoints(run_dir, micro_config) as checkpoints:
+            restored = checkpoints.restore(state)
+            assert int(restored.step) == 2, file
+            checkpoints.save(at_step(restored, 4), wait=True)
+            assert int(checkpoints.restore(state).step) == 4, file
+        shutil.rmtree(run_dir)
+
+
+def test_the_best_is_kept_beside_the_newest(micro_config, state):
+    config = replace(micro_config, train=replace(micro_config.train, keep_best=True))
+    scores = {1: None, 2: 5.0, 3: 3.0, 4: float("nan"), 5: 3.5, 6: None}
+    with Checkpoints(config.train.out, config) as checkpoints:
+        assert checkpoints.best_step is None
+        for step, score in scores.items():
+            checkpoints.save(at_step(state, step), score=score)
+        assert checkpoints.steps == [6, 5, 3]
+        assert checkpoints.best_step == 3
+    with Checkpoints(config.train.out, config) as checkpoints:
+        assert checkpoints.best_step == 3
+        checkpoints.save(at_step(state, 7), score=2.0)
+        assert (checkpoints.steps, checkpoints.best_step) == ([7, 6], 7)
+
+
+def test_without_keep_best_only_the_newest_are_kept(micro_config, state):
+    with Checkpoints(micro_config.train.out, micro_config) as checkpoints:
+        for step, score in enumerate((1.0, 2.0, 3.0)):
+            checkpoints.save(at_step(state, step), score=score)
+        assert (checkpoints.steps, checkpoints.best_step) == ([2, 1], 1)
+
+
+def test_scores_that_cannot_be_read_close_no_run(micro_config, state, run_dir, caplog):
+    (run_dir / "scores.json").write_text("[")
+    with Checkpoints(run_dir, micro_config) as checkpoints:
+        assert (checkpoints.steps, checkpoints.best_step) == ([4, 2], None)
+    assert "scores.json cannot be read" in caplog.text
+
+
+def test_other_devices_restore_the_same(micro_config, state):
+    mine, theirs = (put_everywhere(state, data_mesh(jax.devices()[:count])) for count in (1, 2))
+    with Checkpoints(micro_config.train.out, micro_config) as checkpoints:
+        checkpoints.save(at_step(mine, 2), wait=True)
+        restored = checkpoints.restore(theirs)
+    jax.tree.map(np.testing.assert_array_equal, restored.params, state.params)
+    assert restored.params["trainable"]["weights"].sharding == theirs.params["trainable"]["weights"].sharding
+
+
+@contextmanager
+def full_disk(most: int = 50_000) -> Iterator[None]:
+    """Files cannot grow any more, which is what a full disk looks like to those who write them."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def save_and_train_on(config, state, *, wait: bool) -> None:
+    with Checkpoints(config.train.out, config) as checkpoints:
+        checkpoints.save(state, wait=wait)
+        while True:
+            checkpoints.confirm_write()
+            time.sleep(0.01)
+
+
+def test_a_full_disk_is_named_and_costs_no_checkpoint(micro_config, state, run_dir):
+    too_much = at_step(state_of(100_000), 6)
+    what = r"checkpoint 6 in .* could not be written .*MiB .*free there\). Those before it are as they were"
+    for wait in (True, False):
+        with full_disk(), pytest.raises(CheckpointNotWritten, match=what):
+            save_and_train_on(micro_config, too_much, wait=wait)
+    assert not (run_dir / "seals" / "6.json").exists()
+    with Checkpoints(run_dir, micro_config) as checkpoints:
+        assert checkpoints.steps == [4, 2]
+        assert int(checkpoints.restore(state).step) == 4
+        checkpoints.save(too_much, wait=True)
