@@ -1,56 +1,74 @@
 """The training loop: everything with an effect. The mathematics is in `step.py`."""
 
 import logging
-import math
-import os
-import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Generator
+from contextlib import closing, nullcontext
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
-import cv2
 import jax
 import numpy as np
 
 from poem_jax.batch import MultiViewBatch
 from poem_jax.data.loader import draw_ahead
-from poem_jax.io.atomic import whole_file
-from poem_jax.io.stopping import Stopped
-from poem_jax.models.apply import init
+from poem_jax.mixture.samples import Mixture
+from poem_jax.training.bad_steps import BadSteps, positions_in
 from poem_jax.training.checkpoints import Checkpoints
-from poem_jax.training.config import TrainConfig, git_commit
-from poem_jax.training.journal import Journal
-from poem_jax.training.parallel import Step, check_batch_sizes, compile_step, data_mesh, put_batch, replicated
+from poem_jax.training.config import TrainConfig
+from poem_jax.training.hosts import any_host, is_first_host, names_lost_host
+from poem_jax.training.initial_state import initial_state
+from poem_jax.training.journal import PANELS, Journal
+from poem_jax.training.pace import Pace
+from poem_jax.training.parallel import (
+    Step,
+    check_batch_sizes,
+    compile_step,
+    data_mesh,
+    put_batch,
+    put_everywhere,
+)
+from poem_jax.training.pictures import image_grid
 from poem_jax.training.preflight import check_before_training
-from poem_jax.training.source import BatchAt, drawing_threads, open_training_data, training_batches
-from poem_jax.training.state import TrainState, create_state, restart_moments
+from poem_jax.training.run_report import Sitting, reported
+from poem_jax.training.source import (
+    BatchAt,
+    drawing_threads,
+    open_training_data,
+    training_batches,
+)
+from poem_jax.training.state import TrainState, restart_moments
 from poem_jax.training.step import Metrics
+from poem_jax.training.stopping import stop_after_the_step
 from poem_jax.training.validation import Validation
-from poem_jax.typing import Params
-from poem_jax.weights.store import SHIPPED, flatten, load
+from poem_jax.weights.store import flatten
+
+STOP_EVERY = 4
+"""Steps after which several hosts ask each other whether one of them must stop: it makes all wait for their
+devices."""
 
 log = logging.getLogger(__name__)
 
 
-def train(config: TrainConfig, *, batch_at: BatchAt | None = None) -> TrainState:
+def train(config: TrainConfig, *, batch_at: BatchAt | None = None, command: str | None = None) -> TrainState:
     """Train, or go on from the newest checkpoint of `config.train.out`.
 
-    Stops at `train.steps`, after `train.max_minutes`, or on SIGTERM or SIGINT; always with a checkpoint.
+    Stops at `train.steps`, after `train.max_minutes`, or on SIGTERM or SIGINT; always with a checkpoint, and
+    with a report in the run's folder.
 
     Args:
         config: the experiment.
         batch_at: source of the batches by step; None = what `config.data` says.
+        command: the command line that goes on with the run, for what it says when it stops.
 
     Returns:
         The last state.
 
     Raises:
         FileNotFoundError: a data set of the config, or a file of it, is missing.
-        FloatingPointError: a metric stopped being finite; names it and the step; no checkpoint is written.
+        FloatingPointError: a metric stopped being finite; names it, the step and its samples, and where the
+            batch is; what is not finite goes into no checkpoint.
+        HostLost: another host of the run has ended.
         ModuleNotFoundError: an extra that the run needs is not installed.
         Stopped: SIGTERM or SIGINT came; the step under way and its checkpoint are finished.
         TooManyCorruptSamples: more of the data cannot be used than `data.mixture` allows.
@@ -63,75 +81,30 @@ def train(config: TrainConfig, *, batch_at: BatchAt | None = None) -> TrainState
     check_batch_sizes(config, mesh)
     run_dir = Path(config.train.out)
     mixture = open_training_data(config) if batch_at is None else None
+    sitting = Sitting(config, command)
     with (
+        reported(sitting),
+        names_lost_host(),
         Checkpoints(run_dir, config) as checkpoints,
         nullcontext(batch_at)
         if batch_at is not None
         else training_batches(config, mixture, begun=checkpoints.latest_step is not None) as draw,
     ):
         state = initial_state(config, checkpoints, mesh)
-        first_step = int(state.step)
+        sitting.begin(int(state.step), checkpoints)
+        positions = positions_in(config.data) if batch_at is None else None
+        bad_steps = BadSteps(run_dir, config.train.skip_bad_steps, draw, positions, sitting.left_out)
         batches = draw_ahead(
-            draw, first_step, ahead=config.data.prefetch, workers=drawing_threads(config.data)
+            draw, sitting.step, ahead=config.data.prefetch, workers=drawing_threads(config.data)
         )
-        with Journal(run_dir, config, first_step) as journal, stop_after_the_step() as stopped:
-            run = _Run(config, mesh, checkpoints, journal, stopped)
-            try:
-                return run.go(state, batches)
-            finally:
-                batches.close()
-
-
-def initial_state(config: TrainConfig, checkpoints: Checkpoints, mesh: jax.sharding.Mesh) -> TrainState:
-    """Return the state of the newest checkpoint, or a fresh one, on every device of the mesh."""
-    state = create_state(_first_params(config), config)
-    count = sum(leaf.size for leaf in jax.tree.leaves(state.params["trainable"]))
-    state = jax.device_put(state, replicated(mesh))
-    log.info("devices %s", [str(device) for device in mesh.devices.flat])
-    log.info("%d trainable parameters", count)
-    log.info("git commit %s", git_commit())
-    log.info("config in %s", checkpoints.config_file)
-    if checkpoints.latest_step is not None:
-        state = checkpoints.restore(state)
-        log.info("resumed at step %d from %s", int(state.step), checkpoints.run_dir)
-    return state
-
-
-def _first_params(config: TrainConfig) -> Params:
-    if config.train.init_from is not None:
-        folder = SHIPPED if config.train.init_from == "shipped" else config.train.init_from
-        return load(folder, expected=config.model)[1]
-    return init(config.model, key=jax.random.key(config.train.seed))
-
-
-@contextmanager
-def stop_after_the_step() -> Iterator[threading.Event]:
-    """Turn SIGTERM and SIGINT into an event, so that the step under way and its checkpoint are finished.
-
-    Then `Stopped` is raised; at a second signal at once.
-    """
-    event = threading.Event()
-    received: list[signal.Signals] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        if received:
-            raise Stopped(signal.Signals(number))
-        received.append(signal.Signals(number))
-        event.set()
-        # Not by `logging`: the signal may have come while a line was being written.
-        os.write(2, b"stopping after this step, with a checkpoint; once more: at once\n")
-
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    previous = {kind: signal.signal(kind, note) for kind in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield event
-    finally:
-        for kind, handler in previous.items():
-            signal.signal(kind, handler)
-    if received:
-        raise Stopped(received[0])
+        with (
+            closing(batches),
+            Journal(run_dir, config, sitting.step) as journal,
+            Pace() as pace,
+            stop_after_the_step() as stopped,
+        ):
+            run = _Run(sitting, mesh, checkpoints, journal, pace, bad_steps, mixture)
+            return run.go(state, batches, stopped)
 
 
 class _Run:
@@ -139,48 +112,55 @@ class _Run:
 
     def __init__(
         self,
-        config: TrainConfig,
+        sitting: Sitting,
         mesh: jax.sharding.Mesh,
         checkpoints: Checkpoints,
         journal: Journal,
-        stopped: threading.Event,
+        pace: Pace,
+        bad_steps: BadSteps,
+        mixture: Mixture | None,
     ) -> None:
-        self.config, self.mesh, self.checkpoints, self.journal = config, mesh, checkpoints, journal
-        self.stopped = stopped
-        self.first_stage_step: Step = compile_step(config, mesh, first_stage=True)
-        self.whole_step: Step = compile_step(config, mesh)
-        self.validation = Validation(config, mesh) if config.train.validate_every else None
+        self.sitting, self.config, self.mesh = sitting, sitting.config, mesh
+        self.checkpoints, self.journal, self.pace, self.bad_steps = checkpoints, journal, pace, bad_steps
+        self.first_stage_step: Step = compile_step(self.config, mesh, first_stage=True)
+        self.whole_step: Step = compile_step(self.config, mesh)
+        options = self.config.train
+        looks = options.validate_every or options.panel_every
+        self.validation = Validation(self.config, mesh, mixture) if looks else None
+        self.score: float | None = None
+        """Of the newest state, if it has been validated."""
         self.unread: list[tuple[int, Metrics]] = []
         self.described = False
         self.compiled: set[tuple[bool, tuple[int, ...]]] = set()
-        self.start = self.last_read = time.monotonic()
 
-    def go(self, state: TrainState, batches: Iterator[MultiViewBatch]) -> TrainState:
+    def go(
+        self, state: TrainState, batches: Generator[MultiViewBatch], stopped: threading.Event
+    ) -> TrainState:
         """Step until the end, the time limit or a signal; return the last state."""
         options = self.config.train
-        key = jax.device_put(jax.random.key(options.seed + 1), replicated(self.mesh))
-        step = int(state.step)
-        while step < options.steps and not self._should_stop():
+        key = put_everywhere(jax.random.key(options.seed + 1), self.mesh)
+        step, coming = self.sitting.step, None
+        while step < options.steps and not self._should_stop(step, stopped):
             if step == self.config.first_stage_steps > 0:
                 self._read_metrics()
                 state = restart_moments(state)
-            batch = next(batches)
-            self._describe(step, batch)
-            state = self._step(step, state, put_batch(batch, self.mesh), key)
+            batch = self._place_next(step, batches) if coming is None else coming
+            state = self._step(step, state, batch, key)
             step += 1
-            if step % options.log_every == 0:
-                self._read_metrics()
-            if step % options.checkpoint_every == 0:
-                self._checkpoint(state)
-            if (
-                self.validation
-                and step % options.validate_every == 0
-                and step > self.config.first_stage_steps
-            ):
-                self._validate(step, state)
+            # The next batch goes to the devices while they work on this one; one, not more.
+            coming = self._place_next(step, batches) if step < options.steps else None
+            self._look_and_keep(step, state)
         self._checkpoint(state, wait=True)
         log.info("stopped after step %d of %d", step, options.steps)
+        if step < options.steps:
+            log.info("to go on: %s", self.sitting.how_to_go_on)
         return state
+
+    def _place_next(self, step: int, batches: Generator[MultiViewBatch]) -> MultiViewBatch:
+        with self.pace.waiting():
+            batch = next(batches)
+        self._describe(step, batch)
+        return put_batch(batch, self.mesh)
 
     def _step(self, step: int, state: TrainState, batch: MultiViewBatch, key: jax.Array) -> TrainState:
         first_stage = step < self.config.first_stage_steps
@@ -188,13 +168,29 @@ class _Run:
         self._announce(first_stage, batch.views.shape)
         with jax.transfer_guard("disallow"):
             state, metrics = step_function(state, batch, key)
+        self.pace.started(metrics["loss"], len(batch.views))
         self.unread.append((step, metrics))
         if len(self.unread) > 1:
             # The host stays one step ahead of the devices, not more.
             jax.block_until_ready(self.unread[-2][1]["loss"])
         self.checkpoints.confirm_write()
         self.journal.advance()
+        self.sitting.step, self.score = step + 1, None
         return state
+
+    def _look_and_keep(self, step: int, state: TrainState) -> None:
+        """After a step: metrics, validation, picture and checkpoint, each at its own steps."""
+        options = self.config.train
+        whole = step > self.config.first_stage_steps
+        if step % options.log_every == 0:
+            self._read_metrics()
+        validated = whole and options.validate_every and step % options.validate_every == 0
+        if validated:
+            self._validate(step, state)
+        if whole and options.panel_every and step % options.panel_every == 0:
+            self._draw_panel(step, state)
+        if step % options.checkpoint_every == 0 or (validated and options.keep_best):
+            self._checkpoint(state)
 
     def _announce(self, first_stage: bool, shape: tuple[int, ...]) -> None:
         """Say that a program is compiled, when it is: a minute without news seems a long one."""
@@ -208,24 +204,36 @@ class _Run:
         """Fetch the metrics since the last time, insist that they are finite, and record their means."""
         if not self.unread:
             return
-        fetched = jax.device_get(self.unread)
+        fetched = [
+            (step, {name: float(value) for name, value in metrics.items()})
+            for step, metrics in jax.device_get(self.unread)
+        ]
         self.unread = []
-        check_finite(fetched)
-        now = time.monotonic()
-        means = {name: float(np.mean([metrics[name] for _, metrics in fetched])) for name in fetched[0][1]}
-        means["steps_per_second"] = len(fetched) / max(now - self.last_read, 1e-9)
-        self.last_read = now
-        self.journal.write(fetched[-1][0] + 1, means)
+        good = self.bad_steps.check(fetched)
+        means = {name: float(np.mean([metrics[name] for metrics in good])) for name in (good or [{}])[0]}
+        if self.config.train.skip_bad_steps:
+            means["bad_steps"] = float(len(fetched) - len(good))
+        self.journal.write(fetched[-1][0] + 1, means | self.pace.read())
 
     def _validate(self, step: int, state: TrainState) -> None:
         assert self.validation is not None
         self._read_metrics()
-        self.journal.write(step, self.validation(state), group="validation")
-        self.last_read = time.monotonic()
+        errors = self.validation(state)
+        self.score = self.validation.score(errors)
+        self.journal.write(step, errors, group="validation")
+        self.pace.restart()
+
+    def _draw_panel(self, step: int, state: TrainState) -> None:
+        assert self.validation is not None
+        self._read_metrics()
+        if is_first_host():
+            file = Path(PANELS) / f"step_{step:07d}.png"
+            self.journal.image(step, "held_out", file, self.validation.panel(state))
+        self.pace.restart()
 
     def _checkpoint(self, state: TrainState, *, wait: bool = False) -> None:
         self._read_metrics()
-        self.checkpoints.save(state, wait=wait)
+        self.checkpoints.save(state, wait=wait, score=self.score)
 
     def _describe(self, step: int, batch: MultiViewBatch) -> None:
         """Log what goes in, once a sitting; at step 0 keep a picture of it."""
@@ -234,35 +242,11 @@ class _Run:
         self.described = True
         log.info("batch %s", {name: np.shape(leaf) for name, leaf in flatten(batch).items()})
         if step == 0:
-            picture = image_grid(batch.views)
-            self.journal.image(step, "input", picture)
-            with whole_file(self.checkpoints.run_dir / "input_step0.png") as file:
-                cv2.imwrite(str(file), np.ascontiguousarray(picture[..., ::-1]))
+            self.journal.image(step, "input", Path("input_step0.png"), image_grid(batch.views))
 
-    def _should_stop(self) -> bool:
+    def _should_stop(self, step: int, stopped: threading.Event) -> bool:
+        if jax.process_count() > 1 and step % STOP_EVERY:
+            return False
         limit = self.config.train.max_minutes
-        return self.stopped.is_set() or (limit is not None and time.monotonic() - self.start > 60 * limit)
-
-
-def check_finite(metrics: list[tuple[int, dict[str, Any]]]) -> None:
-    """Insist that every metric of every step is finite.
-
-    Raises:
-        FloatingPointError: names the first step (counted from 0) and its metrics.
-    """
-    for step, values in metrics:
-        bad = {name: float(value) for name, value in values.items() if not math.isfinite(value)}
-        if bad:
-            raise FloatingPointError(
-                f"training stopped: {bad} at step {step} (steps {metrics[0][0]} to {metrics[-1][0]} were "
-                "checked). The newest checkpoint is from before; lower the learning rate, or look at this "
-                f"step's batch: it is the source's batch {step}"
-            )
-
-
-def image_grid(views: np.ndarray, rows: int = 4) -> np.ndarray:
-    """Lay out the first samples as rows and their views as columns: (h, w, 3) uint8, RGB."""
-    pixels = np.asarray(views)[:rows]
-    if pixels.dtype != np.uint8:
-        pixels = np.clip(255.0 * pixels, 0, 255).astype(np.uint8)
-    return np.concatenate([np.concatenate(list(sample), axis=1) for sample in pixels], axis=0)
+        late = limit is not None and time.monotonic() - self.sitting.start > 60 * limit
+        return any_host(stopped.is_set() or late)

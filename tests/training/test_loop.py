@@ -1,23 +1,33 @@
-"""The loop: exact resume, stopping, what it writes, and what it refuses."""
+"""The loop: exact resume, stopping, what it writes, and what it refuses.
+
+What is not slow here trains a stand-in of three weights, whose step compiles at once.
+"""
 
 import json
 import logging
 import os
 import signal
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from poem_jax.io.stopping import Stopped
+from poem_jax.training import initial_state, loop
 from poem_jax.training.checkpoints import Checkpoints, export_run
 from poem_jax.training.config import DataParallel
-from poem_jax.training.loop import check_finite, image_grid, stop_after_the_step, train
+from poem_jax.training.journal import Journal
+from poem_jax.training.loop import STOP_EVERY, train
+from poem_jax.training.pictures import image_grid
 from poem_jax.training.source import synthetic_batches
 from poem_jax.training.state import evaluation_params
+from poem_jax.training.stopping import stop_after_the_step
 from poem_jax.weights.store import load
 
 
@@ -25,8 +35,13 @@ def with_run(config, **options):
     return replace(config, train=replace(config.train, **options))
 
 
-def lines(config):
-    return [json.loads(line) for line in (Path(config.train.out) / "metrics.jsonl").read_text().splitlines()]
+def lines(config, group=None):
+    found = [json.loads(line) for line in (Path(config.train.out) / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in found if group in (None, line["group"])]
+
+
+def report(config):
+    return json.loads((Path(config.train.out) / "report.json").read_text())
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +49,42 @@ def two_devices(monkeypatch):
     """The loop takes every device it finds; two are enough here and compile faster."""
     devices = jax.devices()[:2]
     monkeypatch.setattr(jax, "devices", lambda *_: devices)
+
+
+@pytest.fixture
+def light(monkeypatch):
+    """A model of three weights: its loss is the batch's mean vertex coordinate, and weighs them."""
+
+    def light_step(config, mesh, *, first_stage=False):
+        def step(state, batch, key):
+            loss = jnp.mean(batch.vertices_world)
+            metrics = {"loss": loss, "mpvpe_mm": loss}
+            if config.train.skip_bad_steps:
+                metrics["bad_step"] = 1.0 - jnp.isfinite(loss)
+            moved = jax.tree.map(lambda leaf: leaf + jnp.nan_to_num(loss), state.params["trainable"])
+            return state._replace(step=state.step + 1, params={**state.params, "trainable": moved}), metrics
+
+        return jax.jit(step, donate_argnums=0)
+
+    few = {"trainable": {"w": np.zeros(3, np.float32)}, "statistics": {}, "constants": {}}
+    monkeypatch.setattr(initial_state, "init", lambda model, key: few)
+    monkeypatch.setattr(loop, "compile_step", light_step)
+
+
+@pytest.fixture
+def poisoned(batch_at):
+    """Give a source whose batches of these steps have no vertices."""
+
+    def make(*steps):
+        def draw(step):
+            batch = batch_at(step)
+            if step not in steps:
+                return batch
+            return batch._replace(vertices_world=np.full_like(batch.vertices_world, np.nan))
+
+        return draw
+
+    return make
 
 
 @pytest.mark.slow
@@ -91,30 +142,122 @@ def test_export_writes_the_averages_of_the_newest_checkpoint(micro_config, batch
     jax.tree.map(np.testing.assert_array_equal, params, evaluation_params(state))
 
 
-def test_a_non_finite_loss_stops_the_run_and_names_the_step(micro_config, batch_at):
-    def poisoned(step):
-        batch = batch_at(step)
-        if step == 3:
-            batch = batch._replace(vertices_world=np.full_like(batch.vertices_world, np.nan))
-        return batch
-
+def test_a_non_finite_loss_stops_the_run_and_keeps_the_batch(micro_config, poisoned, light):
     config = with_run(micro_config, steps=8, log_every=4)
-    with pytest.raises(FloatingPointError, match=r"'loss': nan.* at step 3 .*lower the learning rate"):
-        train(config, batch_at=poisoned)
+    with pytest.raises(
+        FloatingPointError, match=r"'loss': nan.* at step 3; the batch is in .*bad_step_3.npz"
+    ):
+        train(config, batch_at=poisoned(3))
     with Checkpoints(config.train.out, config) as checkpoints:
+        assert checkpoints.latest_step == 2
+    assert (Path(config.train.out) / "bad_step_3.png").is_file()
+    assert report(config)["end"].startswith("failed: FloatingPointError: training stopped: {'loss': nan")
+    assert report(config)["checkpoints"]["newest"] == 2
+
+
+def test_bad_steps_are_left_out_until_there_are_too_many(micro_config, poisoned, light):
+    config = with_run(micro_config, steps=6, skip_bad_steps=3)
+    train(config, batch_at=poisoned(1, 2, 3))
+    assert [line["bad_steps"] for line in lines(config)] == [1, 2, 0]
+    assert ["loss" in line for line in lines(config)] == [True, False, True]
+    assert "bad_step" not in lines(config)[0]
+    assert report(config)["sitting"]["steps_left_out"] == [1, 2, 3]
+    fewer = with_run(config, steps=6, skip_bad_steps=1, out=config.train.out + "_2")
+    with pytest.raises(FloatingPointError, match=r"at step 2; .*bad step 2 of this sitting"):
+        train(fewer, batch_at=poisoned(1, 2, 3))
+    with Checkpoints(fewer.train.out, fewer) as checkpoints:
         assert checkpoints.latest_step == 2
 
 
-def test_check_finite_names_the_first_bad_step():
-    good, bad = {"loss": 1.0, "pose": 2.0}, {"loss": 1.0, "pose": np.inf}
-    check_finite([(5, good), (6, good)])
-    with pytest.raises(FloatingPointError, match=r"\{'pose': inf\} at step 6 \(steps 5 to 7"):
-        check_finite([(5, good), (6, bad), (7, bad)])
+def test_one_batch_goes_to_the_devices_while_a_step_runs(micro_config, batch_at, light, monkeypatch):
+    """The next batch is placed before anything waits for the step; none is placed that is not needed."""
+    events = []
+    light_step = loop.compile_step
+
+    def noted_step(config, mesh, **options):
+        step = light_step(config, mesh, **options)
+
+        def noted(*arguments):
+            events.append("step")
+            return step(*arguments)
+
+        return noted
+
+    put, write = loop.put_batch, Journal.write
+    monkeypatch.setattr(loop, "compile_step", noted_step)
+    monkeypatch.setattr(loop, "put_batch", lambda *given: events.append("place") or put(*given))
+    monkeypatch.setattr(
+        Journal, "write", lambda *given, **more: events.append("log") or write(*given, **more)
+    )
+    train(micro_config, batch_at=batch_at)
+    assert events == ["place", *["step", "place"], *["step", "place", "log"], "step", "place", "step", "log"]
 
 
-def test_a_time_limit_and_a_signal_end_with_a_checkpoint(micro_config, batch_at):
+def test_costs_are_in_the_journal(micro_config, batch_at, light):
+    def slow(step):
+        time.sleep(0.15)
+        return batch_at(step)
+
+    config = replace(micro_config, data=replace(micro_config.data, prefetch=1))
+    train(with_run(config, steps=12, log_every=6, checkpoint_every=99), batch_at=slow)
+    last = lines(micro_config)[-1]
+    assert 0 < last["samples_per_second"] == pytest.approx(8 * last["steps_per_second"])
+    assert 0.3 < last["data_wait_share"] <= 1
+    assert last["peak_memory_mb"] > 50
+
+
+class LightValidation:
+    """Errors that grow from the second validation on."""
+
+    def __init__(self, config, mesh, mixture):
+        self.views = config.train.validation_views
+
+    def __call__(self, state):
+        return {f"mpvpe_mm_{n}views": 10.0 + abs(float(state.step) - 3) for n in self.views}
+
+    def score(self, metrics):
+        return min(metrics.values())
+
+    def panel(self, state):
+        return np.full((4, 4, 3), int(state.step), np.uint8)
+
+
+def test_the_best_checkpoint_has_the_score_of_its_own_weights(micro_config, batch_at, light, monkeypatch):
+    saved = []
+    monkeypatch.setattr(loop, "Validation", LightValidation)
+    save = Checkpoints.save
+
+    def noted(self, state, *, wait=False, score=None):
+        saved.append((int(state.step), score))
+        save(self, state, wait=wait, score=score)
+
+    monkeypatch.setattr(Checkpoints, "save", noted)
+    data = replace(micro_config.data, synthetic=replace(micro_config.data.synthetic, num_views=8))
+    config = with_run(replace(micro_config, data=data), steps=6, checkpoint_every=4, validate_every=3)
+    train(config, batch_at=batch_at)
+    assert saved == [(4, None), (6, 13.0)]
+    assert [line["step"] for line in lines(config, "validation")] == [3, 6]
+    saved.clear()
+    best = with_run(config, keep_best=True, out=config.train.out + "_best")
+    train(best, batch_at=batch_at)
+    assert saved == [(3, 10.0), (4, None), (6, 13.0), (6, 13.0)]
+
+
+def test_pictures_of_held_out_samples(micro_config, batch_at, light, monkeypatch):
+    monkeypatch.setattr(loop, "Validation", LightValidation)
+    config = with_run(micro_config, panel_every=2)
+    train(config, batch_at=batch_at)
+    panels = sorted((Path(config.train.out) / "panels").iterdir())
+    assert [file.name for file in panels] == ["step_0000002.png", "step_0000004.png"]
+    assert "step_0000004.png" in (Path(config.train.out) / "report.html").read_text()
+
+
+def test_a_time_limit_and_a_signal_end_with_a_checkpoint(micro_config, batch_at, light, caplog):
+    caplog.set_level(logging.INFO)
     timed = with_run(micro_config, steps=10**6, max_minutes=1e-9)
-    assert int(train(timed, batch_at=batch_at).step) == 0
+    assert int(train(timed, batch_at=batch_at, command="poem train x").step) == 0
+    assert "to go on: poem train x" in caplog.text
+    assert report(timed)["end"] == "the time of `train.max_minutes` was over"
 
     def slow(step):
         if step == 3:
@@ -128,7 +271,28 @@ def test_a_time_limit_and_a_signal_end_with_a_checkpoint(micro_config, batch_at)
         train(endless, batch_at=slow)
     with Checkpoints(endless.train.out, endless) as checkpoints:
         assert 0 < checkpoints.latest_step < 100
+        assert report(endless)["checkpoints"]["newest"] == checkpoints.latest_step
+    assert report(endless)["end"] == "stopped by SIGTERM"
+    assert "to go on: the same command again" in caplog.text
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_several_hosts_ask_each_other_at_the_same_steps(micro_config, monkeypatch):
+    asked = []
+
+    def another_stops(flag):
+        asked.append(flag)
+        return True
+
+    run = SimpleNamespace(config=micro_config, sitting=SimpleNamespace(start=time.monotonic()))
+    stopped = threading.Event()
+    should_stop = loop._Run._should_stop
+    assert not should_stop(run, 1, stopped)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(loop, "any_host", another_stops)
+    steps = [n for n in range(3 * STOP_EVERY) if should_stop(run, n, stopped)]  # pyright: ignore[reportArgumentType]
+    assert steps == [0, STOP_EVERY, 2 * STOP_EVERY]
+    assert asked == [False] * 3
 
 
 def test_a_second_signal_ends_at_once():
@@ -144,7 +308,7 @@ def test_a_second_signal_ends_at_once():
         step()
 
 
-def test_another_config_is_refused_and_the_flag_named(micro_config, batch_at):
+def test_another_config_is_refused_and_the_flag_named(micro_config, batch_at, light):
     config = with_run(micro_config, steps=2)
     train(config, batch_at=batch_at)
     other = replace(config, optimizer=replace(config.optimizer, learning_rate=0.5))
@@ -152,6 +316,7 @@ def test_another_config_is_refused_and_the_flag_named(micro_config, batch_at):
         ValueError, match=r"optimizer.learning_rate: 0.001 -> 0.5.*--train.allow-config-change"
     ):
         train(other, batch_at=batch_at)
+    assert report(config)["end"] == "finished"
     train(with_run(config, log_every=1, max_minutes=3.0), batch_at=batch_at)
     train(with_run(other, allow_config_change=True), batch_at=batch_at)
 
@@ -172,13 +337,9 @@ def test_batches_must_split_over_the_devices_that_are_there(micro_config, batch_
     with pytest.raises(ValueError, match=r"multiple of the number of devices, 3; got \[8\]"):
         train(micro_config, batch_at=batch_at)
     assert not Path(micro_config.train.out).exists()
-    monkeypatch.setattr(jax, "devices", lambda *_: devices)
-    monkeypatch.setattr(jax, "process_count", lambda: 2)
-    with pytest.raises(ValueError, match="one process on the devices of one machine; got 2"):
-        train(micro_config, batch_at=batch_at)
 
 
-def test_errors_of_the_source_arrive(micro_config):
+def test_errors_of_the_source_arrive(micro_config, light):
     def broken(step):
         raise OSError(f"disk gone at {step}")
 
