@@ -7,6 +7,7 @@ import pytest
 from poem_jax.cli.run import parse
 from poem_jax.cli.train import Train, override
 from poem_jax.experiments import open_experiment
+from poem_jax.miniatures import captures
 
 TINY = open_experiment("tiny_synthetic")
 
@@ -29,6 +30,38 @@ def test_what_is_not_an_option_of_train_goes_to_the_experiment(tmp_path):
     assert command.debug
     assert str(command.export) == "x"
     assert override(TINY, command.overrides) == replace(TINY, train=replace(TINY.train, steps=3))
+
+
+def test_the_experiment_is_turned_before_its_fields_are_given(tmp_path):
+    command = parse(
+        ["train", "finetune", "--init", "shipped", "--data", "a", "b", "--train.steps", "3", "--smoke"]
+    )
+    assert isinstance(command, Train)
+    assert (command.init, [str(path) for path in command.data], command.smoke) == (
+        "shipped",
+        ["a", "b"],
+        True,
+    )
+    assert command.overrides == ("--train.steps", "3")
+    captures.write(tmp_path / "desk", frames=2)
+    config = replace(command, data=(tmp_path / "desk",), smoke=False)._config()
+    assert config.train.steps == 3
+    assert config.data.mixture.parts[0].source.folders == (str(tmp_path / "desk"),)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--smoke", "--export", "x"], "give it neither --export nor hosts"),
+        (["--smoke", "--hosts", "auto"], "give it neither --export nor hosts"),
+        (["--hosts", "auto", "--num-hosts", "2"], "give one or the other"),
+        (["--coordinator", "a:1"], "--num-hosts, --host-index is missing"),
+        (["--mano", "x.pkl"], "--mano belongs to --data"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options, what):
+    with pytest.raises(ValueError, match=what):
+        parse(["train", "v2_small_synthetic", *options]).run()
 
 
 def test_help_of_an_experiment_lists_its_fields(capsys):

@@ -8,9 +8,14 @@ import pytest
 from poem_jax import experiments
 from poem_jax.experiments import experiment_names, open_experiment
 from poem_jax.experiments.synthetic_benchmark import benchmark
+from poem_jax.training.config import TrainConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(experiments.__file__).parent
+
+
+def configs_of(name: str) -> dict[str, TrainConfig]:
+    return getattr(importlib.import_module(f"poem_jax.experiments.{name}"), "configs", {})
 
 
 @pytest.mark.parametrize("name", experiment_names())
@@ -34,6 +39,17 @@ def test_configs_has_a_door_to_every_experiment(name):
     assert getattr(module, variable) is getattr(there, variable)
 
 
+@pytest.mark.parametrize("name", [name for name in experiment_names() if configs_of(name)])
+def test_each_of_several_experiments_opens_behind_a_colon_and_keeps_to_its_own_folder(name):
+    several = configs_of(name)
+    opened = [open_experiment(f"{name}:{which}") for which in several]
+    assert opened == list(several.values())
+    folders = [config.train.out for config in (*opened, open_experiment(name))]
+    assert len(set(folders)) == len(folders)
+    assert all(config.train.out == f"runs/{config.name}" for config in opened)
+    assert open_experiment(f"{ROOT}/configs/{name}.py:{next(iter(several))}") == opened[0]
+
+
 def test_configs_has_no_door_to_nothing():
     doors = {path.stem for path in (ROOT / "configs").glob("*.py")}
     assert doors == {path.stem for path in FOLDER.glob("*.py")} - {"__init__"}
@@ -55,6 +71,12 @@ def test_what_cannot_be_opened_is_named(tmp_path):
         open_experiment("tinny")
     with pytest.raises(ValueError, match="no experiment is called 'synthetic_benchmark'"):
         open_experiment("synthetic_benchmark")
+    with pytest.raises(
+        ValueError, match="no experiment is called v1_paper:v3; v1_paper has v1-dexycb, v1-oak"
+    ):
+        open_experiment("v1_paper:v3")
+    with pytest.raises(ValueError, match="tiny_synthetic:v3; tiny_synthetic is one experiment"):
+        open_experiment("tiny_synthetic:v3")
     with pytest.raises(FileNotFoundError, match=r"experiment file not found: .*absent\.py"):
         open_experiment(str(tmp_path / "absent.py"))
     with pytest.raises(FileNotFoundError, match=r"experiment file not found: absent\.py"):

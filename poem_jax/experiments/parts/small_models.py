@@ -3,7 +3,7 @@
 import functools
 from dataclasses import replace
 
-from poem_jax.models.config import Config, Design, ModelConfig, ResNetConfig, Stem
+from poem_jax.models.config import Config, Design, JointDecoderConfig, ModelConfig, ResNetConfig, Stem
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import Cuboid, FrustumConfig
 from poem_jax.models.mesh_transformer_config import (
@@ -26,12 +26,18 @@ DISTANCE_M = 0.4
 _CUBOID = Cuboid((-0.4, -0.4, 0.1), (0.4, 0.4, 0.7))
 _WIDTH, _HEADS, _NEIGHBOURS = 16, 2, 4
 _DETR = DetrConfig(num_layers=1, num_heads=_HEADS, ffn_width=16)
+_JOINT_DECODER = JointDecoderConfig(num_layers=1, width=8, num_heads=2, num_blocks=1, picked_features=2)
 
 
 @functools.singledispatch
 def small(config: ModelConfig) -> ModelConfig:
     """Return the same system with everything small that has a size."""
     raise NotImplementedError(f"say here how a {type(config).__name__} is made small")
+
+
+def with_joint_decoder(config: Config) -> Config:
+    """Return the model with a joint decoder, as thin as the rest."""
+    return replace(config, joint_decoder=_JOINT_DECODER)
 
 
 def _trunk(stages: int, like: ResNetConfig | None = None) -> ResNetConfig:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from poem_jax.experiments.parts.small_models import NUM_VIEWS, small
+from poem_jax.experiments.parts.small_models import NUM_VIEWS, small, with_joint_decoder
 from poem_jax.miniatures import captures, released_tars
 from poem_jax.miniatures.mano_stand_in import write_mano
 from poem_jax.miniatures.names import WRITERS
@@ -28,7 +28,7 @@ from poem_jax.mixture.config import (
     SyntheticSource,
 )
 from poem_jax.models.apply import init
-from poem_jax.models.config import ModelConfig
+from poem_jax.models.config import Config, ModelConfig
 from poem_jax.training.config import BatchShape, DataConfig, RunConfig, TrainConfig
 from poem_jax.weights.store import save
 
@@ -52,6 +52,8 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
         folder: empty; gets stand-ins of the data sets, weights to start from, and the run.
     """
     model = small(config.model)
+    if isinstance(model, Config) and model.joint_decoder is not None:
+        model = with_joint_decoder(model)
     train = config.train
     init_from = None if train.init_from is None else _write_weights(model, folder / "weights")
     return replace(
@@ -69,7 +71,6 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
             checkpoint_every=1,
             keep_best=train.keep_best,
             skip_bad_steps=train.skip_bad_steps,
-            panel_every=STEPS if train.panel_every else 0,
             validate_every=STEPS if train.validate_every else 0,
             validation_samples=2,
             validation_views=(NUM_VIEWS,),
