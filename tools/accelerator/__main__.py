@@ -21,8 +21,6 @@ _LEAST_TRAINING_S = 15.0
 """Beside the time for saving: less would not reach its first step."""
 _STARTING_S = 60.0
 """Of JAX and the driver, where they are slow."""
-_PATIENCE = 2.5
-"""How much longer than its guess a row may take; the next ones are to have a chance."""
 _README = Path(__file__).parents[2] / "README.md"
 
 
@@ -86,7 +84,7 @@ def _measure(measurer: Measurer, plan: Plan, results: Results, budget: Budget, *
             results.note(row.name, {"problem": problem})
         else:
             try:
-                limit = min(left, _PATIENCE * row.about_s + _STARTING_S)
+                limit = min(left, plan.patience * row.about_s + _STARTING_S)
                 results.note(row.name, measurer.measure(row, limit))
             except RowFailed as error:
                 results.note(row.name, {"problem": f"failed: {error}"})

@@ -30,6 +30,8 @@ class Plan:
     machine: Machine
     rows: tuple[Row, ...]
     going_on: TrainConfig
+    patience: float = 2.5
+    """How many times its guess a row may take; the next ones are to have a chance."""
 
 
 def whole_plan() -> Plan:
@@ -98,15 +100,13 @@ def micro_plan() -> Plan:
         ),
     )
     rows = (
-        Inference("micro", model, HALF, 2, 2, about_s=_PATIENT_S),
-        Training("micro", experiment, HALF, 2, about_s=_PATIENT_S),
-        Inference("micro", model, HALF, 2, 1, packed=True, about_s=_PATIENT_S),
-        Fitting(frames=4, views=2, about_s=_PATIENT_S),
+        Inference("micro", model, HALF, 2, 2, about_s=5),
+        Training("micro", experiment, HALF, 2, about_s=5),
+        Inference("micro", model, HALF, 2, 1, packed=True, about_s=5),
+        Fitting(frames=4, views=2, about_s=5),
     )
-    return Plan(Machine(256), rows, experiment)
+    return Plan(Machine(256), rows, experiment, patience=200)
 
 
-_PATIENT_S = 300.0
-"""For a row of a few seconds, on cores that may be busy otherwise."""
 PLANS: dict[str, Callable[[], Plan]] = {"whole": whole_plan, "micro": micro_plan}
 """By the name of their size."""
