@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -19,7 +18,7 @@ from poem_jax.batch import MultiViewBatch
 from poem_jax.training.config import DataParallel, TrainConfig
 from poem_jax.training.state import TrainState
 from poem_jax.training.step import Metrics, train_step
-from poem_jax.typing import Array, PyTree
+from poem_jax.typing import PyTree
 
 AXIS = "data"
 Step = Callable[[TrainState, MultiViewBatch, jax.Array], tuple[TrainState, Metrics]]
@@ -82,24 +81,6 @@ def put_batch(batch: MultiViewBatch, mesh: Mesh) -> MultiViewBatch:
     if jax.process_count() == 1:
         return jax.device_put(batch, sharding)
     return jax.tree.map(lambda rows: jax.make_array_from_process_local_data(sharding, rows), batch)
-
-
-def rows_of_host(batch: MultiViewBatch) -> MultiViewBatch:
-    """Return this host's rows of a batch that all hosts have whole."""
-    host, hosts = jax.process_index(), jax.process_count()
-
-    def own(rows: Array) -> Array:
-        size = len(rows) // hosts
-        return rows[host * size : (host + 1) * size]
-
-    return jax.tree.map(own, batch)
-
-
-def fetch_rows(tree: PyTree) -> PyTree:
-    """Return the rows that all devices hold, whole and as NumPy arrays, on every host."""
-    if jax.process_count() == 1:
-        return jax.device_get(tree)
-    return multihost_utils.process_allgather(tree, tiled=True)
 
 
 def put_everywhere(tree: PyTree, mesh: Mesh) -> PyTree:

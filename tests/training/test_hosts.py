@@ -13,10 +13,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import jax
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 from poem_jax.training.hosts import (
     HostLost,
@@ -29,11 +31,9 @@ from poem_jax.training.hosts import (
 from poem_jax.training.loop import train
 from poem_jax.training.parallel import check_batch_sizes
 from poem_jax.training.source import synthetic_batches
-from tests.training.one_host import config_of
+from tests.training.one_host import MANY, config_of
 
 ROOT = Path(__file__).resolve().parents[2]
-MANY = 100_000
-"""Steps that nobody waits for."""
 
 
 def test_one_process_is_the_first_host_and_waits_for_nobody():
@@ -89,9 +89,11 @@ def test_hosts_draw_the_blocks_of_one_hosts_batch(tmp_path):
     jax.tree.map(lambda one, *rows: np.testing.assert_array_equal(one, np.concatenate(rows)), whole, *parts)
 
 
-def mesh_of(*hosts: int) -> SimpleNamespace:
-    devices = np.array([SimpleNamespace(process_index=host) for host in hosts])
-    return SimpleNamespace(devices=devices, size=len(hosts))
+def mesh_of(*hosts: int) -> Mesh:
+    """A stand-in of a mesh with a device for each of these process numbers."""
+    mesh = create_autospec(Mesh, instance=True, size=len(hosts))
+    mesh.devices = np.array([SimpleNamespace(process_index=host) for host in hosts])
+    return mesh
 
 
 def test_batches_must_split_over_the_devices_of_all_hosts(tmp_path):
@@ -148,8 +150,8 @@ def two_hosts(out: Path, *, steps: int) -> Iterator[Hosts]:
 
 @pytest.fixture(scope="module")
 def sittings(tmp_path_factory) -> SimpleNamespace:
-    """Two hosts of which one is killed after step 2; and two more, which go on and are told to stop by a signal
-    to the second. `alone` is the run as it was at step 2."""
+    """Two hosts of which one is killed after step 2; and two more, which go on and are told to stop by a
+    signal to the second. `alone` is the run as it was at step 2."""
     folder = tmp_path_factory.mktemp("hosts")
     out, alone = folder / "two", folder / "alone"
     with two_hosts(out, steps=MANY) as hosts:
