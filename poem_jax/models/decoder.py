@@ -19,7 +19,7 @@ from poem_jax.geometry.transforms import matmul, rotate_points, transpose
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT
 from poem_jax.models.config import DecoderConfig, DecoderOutput, Design, JointDecoderConfig, NeighbourSearch
 from poem_jax.models.hand_output import palm_frame
-from poem_jax.models.layers import dropout, layer_norm, linear, normal
+from poem_jax.models.layers import Exact, dropout, layer_norm, linear, normal
 from poem_jax.models.point_features import projected_features
 from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import (
@@ -404,8 +404,8 @@ class JointLayer(nnx.Module):
         self.shells_m = config.shells_m
         numbers = 3 + len(cloud(config.shells_m)) + config.picked_features
         self.pick = linear(map_width, config.picked_features, rngs=rngs)
-        self.embed = nnx.Param(normal(rngs.params(), (NUM_JOINTS, numbers, config.width), numbers**-0.5))
-        self.names = nnx.Param(normal(rngs.params(), (NUM_JOINTS, config.width), _EMBEDDING_SCALE))
+        self.embed = Exact(normal(rngs.params(), (NUM_JOINTS, numbers, config.width), numbers**-0.5))
+        self.names = Exact(normal(rngs.params(), (NUM_JOINTS, config.width), _EMBEDDING_SCALE))
         self.blocks = nnx.List(JointBlock(config, rngs=rngs) for _ in range(config.num_blocks))
         self.norm = layer_norm(config.width, PAPER_EPSILON, rngs=rngs)
         self.offset = linear(config.width, 3, exact=True, zero=True, rngs=rngs)

@@ -27,5 +27,5 @@ def sample_deformed(
     places = jnp.moveaxis(locations, -5, -3)
     samples = sample_levels(by_head, places.reshape(*batch, head, level, query * point, 2))
     samples = samples.reshape(*batch, head, level, query, point, -1)
-    read = jnp.einsum("...hlqpc,...qhlp->...qhc", samples, weights)
+    read = jnp.einsum("...hlqpc,...qhlp->...qhc", samples, weights.astype(samples.dtype))
     return jnp.reshape(read, (*batch, query, -1))

@@ -38,6 +38,6 @@ class DecoderRow(Row):
 
 def recompute(model: object, kinds: tuple[type[Row], ...]) -> None:
     """Let all rows of these kinds compute the insides of their blocks again."""
-    for _, part in nnx.iter_graph(model):
+    for _, part in nnx.iter_graph(model) if kinds else ():
         if isinstance(part, kinds):
             part.recomputed = True
