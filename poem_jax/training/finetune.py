@@ -79,7 +79,8 @@ def train_on(config: TrainConfig, paths: Sequence[str | Path], *, mano: Path | N
     kinds = [recognise(path) for path in paths]
     captures = tuple(str(path) for path, kind in zip(paths, kinds, strict=True) if kind is Kind.CAPTURE)
     sources: list[FramesSource] = [
-        source_at(path, kind, split=None, mano=mano)
+        # A folder may hold shards of several splits; those that are trained on are meant.
+        source_at(path, kind, split="train" if Path(path).is_dir() and kind is Kind.TARS else None, mano=mano)
         for path, kind in zip(paths, kinds, strict=True)
         if kind is not Kind.CAPTURE
     ]

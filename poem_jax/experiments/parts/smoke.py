@@ -55,11 +55,12 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
     if isinstance(model, Config) and model.joint_decoder is not None:
         model = with_joint_decoder(model)
     train = config.train
+    shared_by = train.host_devices * config.compute.accumulate
     init_from = None if train.init_from is None else _write_weights(model, folder / "weights")
     return replace(
         config,
         model=model,
-        data=_data(config.data, model, folder, -(-_SAMPLES // train.host_devices) * train.host_devices),
+        data=_data(config.data, model, folder, -(-_SAMPLES // shared_by) * shared_by),
         first_stage_steps=min(config.first_stage_steps, 1),
         optimizer=replace(config.optimizer, warmup_steps=min(config.optimizer.warmup_steps, 1)),
         train=RunConfig(
