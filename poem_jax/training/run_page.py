@@ -24,6 +24,7 @@ class _Plot:
     y_label: str
     has: Callable[[str, str], bool]
     """Of a group and a name."""
+    may_be_log: bool = False
 
 
 _COSTS = ("steps_per_second", "samples_per_second", "data_wait_share", "peak_memory_mb", "bad_steps")
@@ -39,8 +40,8 @@ def _is_term(group: str, name: str) -> bool:
 
 
 _PLOTS = (
-    _Plot("Loss", "loss", _train("loss")),
-    _Plot("Terms of the loss", "term, unweighted", _is_term),
+    _Plot("Loss", "loss", _train("loss"), True),
+    _Plot("Terms of the loss", "term, unweighted", _is_term, True),
     _Plot("Errors, training samples", "mm", lambda group, name: group == "train" and name.endswith("_mm")),
     _Plot(
         "Key points, training samples", "px", lambda group, name: group == "train" and name.endswith("_px")
@@ -56,7 +57,7 @@ _PLOTS = (
         lambda group, name: group == "validation" and not name.startswith("mpvpe_mm"),
     ),
     _Plot("Learning rate", "rate", _train("learning_rate")),
-    _Plot("Gradient", "norm", _train("gradient_norm")),
+    _Plot("Gradient", "norm", _train("gradient_norm"), True),
     _Plot("Speed", "samples / s", _train("samples_per_second")),
     _Plot("Waiting for data", "share of the time", _train("data_wait_share")),
     _Plot("Memory", "MB, largest so far", _train("peak_memory_mb")),
@@ -96,7 +97,9 @@ def _figures(entries: Sequence[Entry]) -> list[str]:
             if plot.has(group, name) and np.isfinite(values[1]).any()
         ]
         if curves:
-            drawn.append(figure(plot.title, curves, x_label="step", y_label=plot.y_label))
+            drawn.append(
+                figure(plot.title, curves, x_label="step", y_label=plot.y_label, may_be_log=plot.may_be_log)
+            )
     return drawn
 
 

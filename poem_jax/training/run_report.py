@@ -142,7 +142,8 @@ def _facts(report: Mapping[str, Any]) -> dict[str, str]:
         "best checkpoint": "" if saved["best"] is None else f"step {saved['best']}",
         "this sitting": f"from step {sitting['first_step']}, {sitting['seconds']} s",
         "steps left out": ", ".join(map(str, sitting["steps_left_out"])),
-        "devices": f"{', '.join(report['devices'])} on {report['hosts']} hosts",
+        "devices": ", ".join(report["devices"]),
+        "hosts": str(report["hosts"]),
         "commit": report["git_commit"],
     }
     newest = report["train"] or {}

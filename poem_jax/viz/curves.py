@@ -10,13 +10,13 @@ import numpy as np
 from poem_jax.typing import Float
 
 _W, _H = 400, 250
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 10, 10, 42
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 20, 10, 42
 """Margins of the plot in the drawing's own units, which are pixels on a phone."""
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#7f7f7f")
 """Tell apart also by those who see fewer colours (Okabe and Ito, 2008)."""
 _MOST_POINTS = 300
 _LOG_FROM = 30.0
-"""The largest value over the smallest from which an axis of positive values is logarithmic."""
+"""The largest value over the smallest from which an axis of positive values may be logarithmic."""
 
 
 class Curve(NamedTuple):
@@ -27,7 +27,9 @@ class Curve(NamedTuple):
     y: Float[np.ndarray, " point"]
 
 
-def figure(title: str, curves: Sequence[Curve], *, x_label: str, y_label: str) -> str:
+def figure(
+    title: str, curves: Sequence[Curve], *, x_label: str, y_label: str, may_be_log: bool = False
+) -> str:
     """Draw curves in one plot, as a `<figure>` with a title and a legend.
 
     Values that are not finite are left out, and long curves are averaged down to 300 points.
@@ -36,6 +38,7 @@ def figure(title: str, curves: Sequence[Curve], *, x_label: str, y_label: str) -
         title: above the plot.
         curves: at least one value in all.
         x_label, y_label: with units.
+        may_be_log: positive values over more than a factor of 30 have a logarithmic axis.
 
     Raises:
         ValueError: no value is finite.
@@ -47,7 +50,7 @@ def figure(title: str, curves: Sequence[Curve], *, x_label: str, y_label: str) -
     x_axis = _Axis.over(np.concatenate([curve.x for curve in curves]), log=False)
     values = np.concatenate([curve.y for curve in curves])
     low, high = float(values.min()), float(values.max())
-    y_axis = _Axis.over(values, log=low > 0 and high > _LOG_FROM * low)
+    y_axis = _Axis.over(values, log=may_be_log and low > 0 and high > _LOG_FROM * low)
     y_label += ", logarithmic" if y_axis.log else ""
     lines = "".join(_line(curve, x_axis, y_axis, _colour(i)) for i, curve in enumerate(curves))
     legend = "".join(
@@ -74,7 +77,7 @@ class _Axis(NamedTuple):
         if log:
             return _Axis(low, high, True, _decades(low, high))
         if low == high:
-            low, high = low - (abs(low) or 1) / 2, high + (abs(high) or 1) / 2
+            low, high = min(0.0, 2 * low), max(0.0, 2 * high) or float(low == 0)
         step = _round_up((high - low) / 5)
         low = math.floor(low / step + 1e-9) * step
         high = math.ceil(high / step - 1e-9) * step

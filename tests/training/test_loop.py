@@ -287,10 +287,10 @@ def test_several_hosts_ask_each_other_at_the_same_steps(micro_config, monkeypatc
     run = SimpleNamespace(config=micro_config, sitting=SimpleNamespace(start=time.monotonic()))
     stopped = threading.Event()
     should_stop = loop._Run._should_stop
-    assert not should_stop(run, 1, stopped)  # pyright: ignore[reportArgumentType]
+    assert not should_stop(run, 1, stopped)
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     monkeypatch.setattr(loop, "any_host", another_stops)
-    steps = [n for n in range(3 * STOP_EVERY) if should_stop(run, n, stopped)]  # pyright: ignore[reportArgumentType]
+    steps = [n for n in range(3 * STOP_EVERY) if should_stop(run, n, stopped)]
     assert steps == [0, STOP_EVERY, 2 * STOP_EVERY]
     assert asked == [False] * 3
 

@@ -33,7 +33,7 @@ def run(micro_config):
         journal.write(3, {"mpvpe_mm_2views": 8.0, "mpvpe_mm_8views": 2.5}, group="validation")
     sitting = Sitting(micro_config, "poem train tiny 'a b'")
     sitting.first_step, sitting.step = 1, 3
-    sitting.checkpoints = SAVED  # pyright: ignore[reportAttributeAccessIssue]
+    sitting.checkpoints = SAVED
     return sitting
 
 
