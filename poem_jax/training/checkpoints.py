@@ -39,7 +39,7 @@ class Checkpoints:
     """The checkpoints of one run directory; use it as a context manager."""
 
     def __init__(self, run_dir: str | Path, config: TrainConfig, *, read_only: bool = False) -> None:
-        """Open or make a run directory; `read_only` leaves it to the run that may be writing there."""
+        """Open or make a run directory; `read_only` leaves it to the run that may write there."""
         self.run_dir = Path(run_dir).resolve()
         self._place = self.run_dir / _FOLDER
         self.config = config
@@ -178,7 +178,7 @@ class Checkpoints:
         unchecked = [step for step in self.steps if step not in checked]
         for step in checked + unchecked:
             try:
-                state = self._read(step, like)
+                state = self.read(step, like)
             except ValueError as error:
                 problems.append(str(error))
                 continue
@@ -194,7 +194,8 @@ class Checkpoints:
             f"{'; '.join(problems)}. Remove that step's folder to begin anew, or choose another --train.out"
         )
 
-    def _read(self, step: int, like: TrainState) -> TrainState:
+    def read(self, step: int, like: TrainState) -> TrainState:
+        """Read this checkpoint as `restore` does; `ValueError` if it is damaged or does not fit `like`."""
         template = flatten(like)
         with names_damage(step, self._place):
             # One host is enough: the files are the same for all.
@@ -231,18 +232,17 @@ class Checkpoints:
 
 
 def export_run(config: TrainConfig, path: str | Path, *, dtype: Any = np.float16) -> int:
-    """Write the averaged weights of a run's newest checkpoint as a model that `poem_jax.load` reads.
+    """Write the averaged weights of a run's newest checkpoint, with `keep_best` of its best one, as a model
+    that `poem_jax.load` reads; return its step.
 
     Args:
         config: the experiment; `train.out` names the run.
         path: folder to write; replaced if it exists.
         dtype: storage type of weights and statistics; None = float32.
-
-    Returns:
-        The step whose weights were written.
     """
     fresh = create_state(init(config.model, key=jax.random.key(0)), config)
     with Checkpoints(config.train.out, config, read_only=True) as checkpoints:
-        state = checkpoints.restore(fresh)
+        best = checkpoints.best_step if config.train.keep_best else None
+        state = checkpoints.restore(fresh) if best is None else checkpoints.read(best, fresh)
     save(path, config.model, evaluation_params(state), dtype=dtype, overwrite=True)
     return int(state.step)

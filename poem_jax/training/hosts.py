@@ -166,7 +166,8 @@ def names_lost_host() -> Iterator[None]:
     """Turn what the collectives say when a host has gone into a `HostLost`; other errors stay as they are."""
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        # A ValueError where it shows when an array is fetched.
         if jax.process_count() == 1 or not any(word in str(error) for word in _LOST):
             raise
         message = (

@@ -170,6 +170,7 @@ def test_the_best_is_kept_beside_the_newest(micro_config, state):
         assert checkpoints.best_step == 3
     with Checkpoints(config.train.out, config) as checkpoints:
         assert checkpoints.best_step == 3
+        assert int(checkpoints.read(3, state).step) == 3
         checkpoints.save(at_step(state, 7), score=2.0)
         assert (checkpoints.steps, checkpoints.best_step) == ([7, 6], 7)
 
