@@ -5,6 +5,7 @@ Only warnings, errors and the end by a signal carry the prefix `poem:`.
 
 import contextlib
 import logging
+import shlex
 import sys
 import time
 from collections.abc import Iterator
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
 def say(text: str) -> None:
     """Tell what the command is doing."""
     print(text, file=sys.stderr, flush=True)
+
+
+def called_as() -> str:
+    """Return the command line of this process, as it can be given again: `poem train ...`, or the script."""
+    program, *arguments = sys.argv
+    is_script = program.endswith(".py")
+    return shlex.join([*(["python", program] if is_script else [Path(program).name]), *arguments])
 
 
 def set_up_logging() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from poem_jax.cli.messages import say, tells_what_is_left
+from poem_jax.cli.messages import called_as, say, tells_what_is_left
 from poem_jax.cli.options import Experiment, Flag, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class Train:
 
         out, steps = config.train.out, config.train.steps
         with tells_what_is_left(Path(out)):
-            state = train(config)
+            state = train(config, command=called_as())
         print(f"step {int(state.step)} of {steps}; checkpoints and metrics are in {out}")
 
     def _export(self, config: "TrainConfig") -> None:
