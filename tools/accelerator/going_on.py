@@ -70,7 +70,7 @@ def _train(config: TrainConfig, processes: int) -> None:
     from tools.accelerator.captures import drawn_by_processes
 
     with drawn_by_processes(config.data, processes) as batch_at:
-        train(config, batch_at=batch_at)
+        train(config, batch_at=batch_at, command="make accelerator")
 
 
 def main(arguments: list[str]) -> int:
