@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def write(root: Path, *, frames: int = 4, seed: int = 0) -> list[PlantedFrame]:
     return shown
 
 
-def _labels(shown: list[PlantedFrame]) -> dict[str, np.ndarray]:
+def _labels(shown: list[PlantedFrame]) -> dict[str, Any]:
     """Return the hands of all frames in the world of the rig."""
     T_world_from_cam = invert_rigid(shown[0].T_cam_from_world[0])
     pose = np.stack([frame.pose_cam[0] for frame in shown])
