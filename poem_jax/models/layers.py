@@ -12,7 +12,7 @@ takes a minute. Under a trace JAX draws them: other numbers of the same distribu
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -49,9 +49,14 @@ class Exact(nnx.Param):
     coordinates or a logit. So what it gives is in float32, too."""
 
 
-def in_type_of_weights(arrays: tuple[Array, Array, Array | None], *, dtype: Any = None) -> tuple:
-    """Cast (inputs, kernel, bias) to the kernel's type; `dtype` is of no account."""
-    return tuple(None if x is None else jnp.asarray(x, arrays[1].dtype) for x in arrays)
+_Arrays = TypeVar("_Arrays", bound=tuple)
+
+
+def in_type_of_weights(arrays: _Arrays, /, *, dtype: Any = None, inexact: bool = True) -> _Arrays:
+    """Cast (inputs, kernel, bias or None) to the kernel's type, as `nnx.Linear` asks; the rest is of no
+    account."""
+    kernel = arrays[1]
+    return tuple(None if x is None else jnp.asarray(x, kernel.dtype) for x in arrays)  # pyright: ignore[reportReturnType]
 
 
 def trunk_images(
@@ -371,7 +376,7 @@ def layer_norm(channels: int, epsilon: float, *, rngs: nnx.Rngs) -> nnx.LayerNor
     """Make a normalisation of the last axis (Ba et al. 2016), its variance in two passes; the result has the
     type of what is normalised."""
     layer = _LayerNorm(channels, epsilon=epsilon, use_fast_variance=False, rngs=rngs)
-    layer.scale, layer.bias = (Exact(leaf[...]) for leaf in (layer.scale, layer.bias))
+    layer.scale, layer.bias = Exact(filled(1.0, channels)), Exact(filled(0.0, channels))
     return layer
 
 
