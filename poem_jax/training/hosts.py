@@ -3,9 +3,11 @@
 All of it is `jax.distributed`. Where there is one process, nothing here waits or talks to anybody.
 """
 
+import atexit
 import hashlib
 import logging
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,11 +25,23 @@ END_TIMEOUT_S = 20
 """How long a host that ends waits for the others to end too."""
 
 _NETWORK_DISK_S = 10
+_LOST_STATUS = 2
+_lost: list[str] = []
+"""What was said when another host was lost."""
 _log = logging.getLogger(__name__)
 
 
 class HostLost(ConnectionError):
     """Another host of the run has ended, so that this one cannot go on."""
+
+
+def _end_without_the_lost() -> None:
+    """End now, where JAX would wait for the lost host and then abort with pages of its own."""
+    if _lost:
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_LOST_STATUS)
 
 
 def start_hosts(coordinator: str | None, count: int | None, index: int | None) -> None:
@@ -70,6 +84,8 @@ def start_hosts(coordinator: str | None, count: int | None, index: int | None) -
             "all of them within 5 minutes, each with its own --host-index; the port must be free on the "
             "first host, and open to the others"
         ) from error
+    # Called before what JAX has registered, which waits for the other hosts.
+    atexit.register(_end_without_the_lost)
 
 
 def _check(coordinator: str, count: int, index: int) -> None:
@@ -177,6 +193,7 @@ def names_lost_host() -> Iterator[None]:
         )
         # Now, since JAX may end this process while it still waits for a write that the other takes part in.
         _log.error("%s", message)
+        _lost.append(message)
         raise HostLost(message) from error
 
 
