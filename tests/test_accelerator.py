@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.training.checkpoints import _CHECKSUMS
 from poem_jax.training.source import synthetic_batches
 from tests.accelerator_rows import Ending, Planted
 from tools.accelerator import going_on, parts, readme
@@ -200,14 +201,13 @@ def test_the_readme_has_the_place_for_the_table(tmp_path):
 @pytest.mark.parametrize(
     ("ending", "code"), [("sys.exit(7)", 7), ("time.sleep(60)", -signal.SIGKILL)], ids=["ends", "goes on"]
 )
-def test_a_training_whose_time_is_up_may_save_and_is_ended_then(monkeypatch, ending, code):
-    monkeypatch.setattr(going_on, "_LAST_WORDS_S", 1.0)
+def test_a_training_whose_time_is_up_may_save_and_is_ended_then(ending, code):
     saves = f"import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: {ending})"
     command = [sys.executable, "-c", f"{saves}; print(flush=True); [time.sleep(1) for _ in range(60)]"]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        assert going_on._waited_for(process, 0.1) == code
+        assert going_on.stop(process, 1.0) == code
 
 
 def sitting(tmp_path: Path, until_step: int) -> str:
@@ -255,6 +255,9 @@ def test_what_is_measured_and_trained_goes_on_elsewhere(tmp_path):
     reached = stored["going_on"]["train"]["step"]
     assert reached >= 4
     (tmp_path / "run").rename(tmp_path / "lost")
+    assert list((tmp_path / "lost" / _CHECKSUMS).glob("*.json")), (
+        "the last checkpoint was not seen to its end"
+    )
     said = sitting(tmp_path, until_step=reached + 2)
     assert said.count("measured before") == len(stored["rows"])
     assert "goes on in" in said

@@ -20,6 +20,8 @@ from tools.accelerator.results import Figures
 _LAST_WORDS_S = 30.0
 """For the step under way and its checkpoint when the time is up; then the process is killed, and the
 checkpoint before stands."""
+_PATIENCE_S = 300.0
+"""For the same after a signal, which sets no time."""
 SAVING_S = _LAST_WORDS_S + 10.0
 """Kept for that and for packing the run."""
 
@@ -36,33 +38,33 @@ def train_on(run: Path, size: str, budget: Budget, *, on_cpu: bool) -> int:
     process = subprocess.Popen(command, env=environment, start_new_session=True)
     try:
         # Starting and compiling take their share before the run's own clock begins.
-        return _waited_for(process, budget.left(keep=SAVING_S))
+        return process.wait(budget.left(keep=SAVING_S))
+    except subprocess.TimeoutExpired:
+        return stop(process, _LAST_WORDS_S)
     except KeyboardInterrupt:
-        process.send_signal(signal.SIGTERM)
-        _waited_for(process, _LAST_WORDS_S)
+        stop(process, _PATIENCE_S)
         raise
+
+
+def stop(process: "subprocess.Popen[bytes]", seconds: float) -> int:
+    """Ask a process to end, once, for a second signal would end it at once; kill it after so long."""
+    process.send_signal(signal.SIGTERM)
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 def figures_of(run: Path) -> Figures:
     """Return what the journal of a run says last of its pace, its loss and its validation."""
     file = run / "metrics.jsonl"
-    lines = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    text = file.read_text(encoding="utf-8") if file.exists() else ""
     found: Figures = {}
-    for line in lines:
+    # The last line may be half written.
+    for line in map(json.loads, text.split("\n")[:-1]):
         found[line["group"]] = {key: value for key, value in line.items() if key != "group"}
     return found
-
-
-def _waited_for(process: "subprocess.Popen[bytes]", seconds: float) -> int:
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGTERM)
-    try:
-        return process.wait(_LAST_WORDS_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
 
 
 def _train(config: TrainConfig, processes: int) -> None:
