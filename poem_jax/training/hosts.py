@@ -162,8 +162,8 @@ def check_shared_folder(folder: Path, option: str) -> None:
         file.unlink(missing_ok=True)
     if lonely:
         raise ValueError(
-            f"all hosts write to one folder, but {folder} is not the same on all of them; give an {option} "
-            "on a disk that they share"
+            f"all hosts write to one folder, but {folder} is not the same on all of them; give {option} a "
+            "folder on a disk that they share"
         )
 
 

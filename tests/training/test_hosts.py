@@ -18,12 +18,14 @@ from unittest.mock import create_autospec
 import jax
 import numpy as np
 import pytest
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from poem_jax.training import hosts
 from poem_jax.training.hosts import (
     HostLost,
     any_host,
+    check_same_everywhere,
     is_first_host,
     names_lost_host,
     start_hosts,
@@ -84,9 +86,33 @@ def test_a_lost_host_is_named_and_other_errors_stay(monkeypatch, kind):
         raise kind("RESOURCE_EXHAUSTED: out of memory")
 
 
+def test_what_hosts_must_have_alike_is_compared(monkeypatch):
+    others = [1, 0]
+
+    def gather(own):
+        return np.stack([own + np.uint8(other) for other in (0, others.pop())])
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(multihost_utils, "process_allgather", gather)
+    check_same_everywhere("config", "a")
+    with pytest.raises(ValueError, match=r"the same config; hosts \[1\] have another than the first one"):
+        check_same_everywhere("config", "a")
+
+
+def test_a_folder_that_is_not_shared_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(hosts, "wait_for_all", lambda _: None)
+    monkeypatch.setattr(hosts, "any_host", lambda flag: flag)
+    hosts.check_shared_folder(tmp_path, "--train.out")
+    monkeypatch.setattr(hosts, "any_host", lambda flag: True)
+    with pytest.raises(ValueError, match=r"is not the same on all of them; give --train.out a folder"):
+        hosts.check_shared_folder(tmp_path, "--train.out")
+    assert not list(tmp_path.iterdir())
+
+
 def test_hosts_draw_the_blocks_of_one_hosts_batch(tmp_path):
     data = config_of(tmp_path, steps=1).data
-    (whole,) = (synthetic_batches(data)(3),)
+    whole = synthetic_batches(data)(3)
     parts = [synthetic_batches(data, host=host, hosts=2)(3) for host in range(2)]
     assert not np.array_equal(parts[0].joints_world, parts[1].joints_world)
     jax.tree.map(lambda one, *rows: np.testing.assert_array_equal(one, np.concatenate(rows)), whole, *parts)
