@@ -319,6 +319,7 @@ class TrainConfig:
             f"`first_stage_steps` must be 0 for a {type(self.model).__name__} without a first stage; "
             f"got {self.first_stage_steps}",
         )
+        looks = run.validate_every or run.panel_every
         least, most = self.model.view_range
         counts = sorted({shape.num_views for shape in self.data.batches})
         require(
@@ -327,7 +328,7 @@ class TrainConfig:
             f"{type(self.model).__name__} are made for; got {counts}. `min_views` gives samples fewer",
         )
         require(
-            not run.validate_every or max(run.validation_views) <= (most or max(run.validation_views)),
+            not looks or max(run.validation_views) <= (most or max(run.validation_views)),
             f"`train.validation_views` must not exceed {most}, which the layers of this "
             f"{type(self.model).__name__} are made for; got {run.validation_views}",
         )
@@ -337,7 +338,7 @@ class TrainConfig:
             f"`data.batches` asks for {max_views} views, but `data.synthetic.num_views` is {data.num_views}",
         )
         require(
-            not run.validate_every or max(run.validation_views) <= data.num_views,
+            not looks or max(run.validation_views) <= data.num_views,
             f"`train.validation_views` must not exceed `data.synthetic.num_views` = {data.num_views}; "
             f"got {run.validation_views}",
         )

@@ -15,14 +15,14 @@ GOOD, BAD = {"loss": 1.0, "pose": 2.0}, {"loss": 1.0, "pose": np.inf}
 
 @pytest.fixture
 def watch(tmp_path, batch_at):
-    """Rows 2 and 3 of step 6 have no vertices."""
+    """Rows 2 and 3 of step 6 lack a vertex."""
 
     def draw(step):
         batch = batch_at(step)
         if step != 6:
             return batch
         vertices = batch.vertices_world.copy()
-        vertices[2:4] = np.nan
+        vertices[2:4, 5] = np.nan
         return batch._replace(vertices_world=vertices)
 
     def make(allowed=0, positions=None):
@@ -52,7 +52,7 @@ def test_the_first_bad_step_is_named_with_its_samples_and_its_batch(watch, tmp_p
         watch(positions=positions).check([(5, GOOD), (6, BAD), (7, BAD)])
     with np.load(tmp_path / "bad_step_6.npz") as kept:
         np.testing.assert_array_equal(kept["samples"], range(96, 104))
-        assert np.isnan(kept["vertices_world"][2:4]).all()
+        assert np.isnan(kept["vertices_world"][2:4, 5]).all()
         assert kept["views"].shape == (8, 3, 32, 32, 3)
         views = kept["views"]
     picture = cv2.imread(str(tmp_path / "bad_step_6.png"))[..., ::-1]

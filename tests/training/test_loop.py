@@ -245,7 +245,7 @@ def test_the_best_checkpoint_has_the_score_of_its_own_weights(micro_config, batc
 
 def test_pictures_of_held_out_samples(micro_config, batch_at, light, monkeypatch):
     monkeypatch.setattr(loop, "Validation", LightValidation)
-    config = with_run(micro_config, panel_every=2)
+    config = with_run(micro_config, panel_every=2, validation_views=(2,))
     train(config, batch_at=batch_at)
     panels = sorted((Path(config.train.out) / "panels").iterdir())
     assert [file.name for file in panels] == ["step_0000002.png", "step_0000004.png"]
