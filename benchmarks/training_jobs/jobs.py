@@ -44,15 +44,20 @@ def time_compute(
 def measure_memory(
     name: str, samples: int, views: int, thin: bool, form: str, resident: bool
 ) -> dict[str, float]:
-    """Return what a step needs beside state and batch, by the compiler's own account, in GB; and, if it is to
-    be taken, the peak of this process after compiling and the seconds of the second step."""
+    """Return what a step keeps for its backward pass, and what its program needs beside state and batch by
+    the compiler's own account, in GB.
+
+    `resident`: also take the step, for the peak of this process after compiling and the second one's seconds.
+    """
     config = replace(experiment(name, samples, views, thin=thin), compute=COMPUTE[form])
     mesh = data_mesh()
-    batch, state = put_batch(synthetic_batches(config.data)(0), mesh), fresh_state(config, mesh)
+    drawn = synthetic_batches(config.data)(0)
+    batch, state = put_batch(drawn, mesh), fresh_state(config, mesh)
     key = jax.random.key(0)
     program = compile_step(config, mesh).lower(state, batch, key).compile()  # pyright: ignore[reportFunctionMemberAccess]
     needed = program.memory_analysis()
     found = {
+        "kept": kept_gb(config, drawn),
         "temporary": needed.temp_size_in_bytes / 1e9,
         "arguments": needed.argument_size_in_bytes / 1e9,
     }

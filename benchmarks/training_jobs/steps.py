@@ -12,11 +12,16 @@ import jax
 
 from poem_jax.batch import MultiViewBatch
 from poem_jax.experiments import open_experiment
+from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.apply import init
 from poem_jax.models.config import Config, ResNetConfig
+from poem_jax.models.network import describe, forward
+from poem_jax.models.precision import cast_weights
 from poem_jax.training.config import BatchShape, ComputeConfig, Precision, Rematerialise, TrainConfig
 from poem_jax.training.parallel import compile_step, put_batch, put_everywhere
 from poem_jax.training.state import TrainState, create_state
+from poem_jax.training.step import RECOMPUTED
+from poem_jax.typing import Array, Params
 
 COMPUTE = {
     "float32": ComputeConfig(),
@@ -80,6 +85,29 @@ def stepper(
         return {name: float(value) for name, value in metrics.items()}
 
     return go
+
+
+def kept_gb(config: TrainConfig, batch: MultiViewBatch) -> float:
+    """Return what JAX carries from a step's forward pass to its backward one, in GB; nothing is computed."""
+    model, compute = config.model, config.compute
+    params = describe(model)
+    root = batch.joints_world[:, ROOT_JOINT] if model.takes_root else None
+
+    def backward(trainable: Params, fixed: Params, views: Array) -> Any:
+        def found(trainable: Params) -> list[Array]:
+            whole = {**fixed, "trainable": trainable}
+            if compute.precision is Precision.BFLOAT16:
+                whole = cast_weights(whole, model)
+            options = {"config": model, "root_world": root, "train": True}
+            rows = RECOMPUTED[compute.rematerialise]
+            seen, _ = forward(whole, views, batch.cameras, recomputed=rows, **options)
+            given = [seen.layers_world, seen.vertices_world, seen.keypoints_px, seen.heat_maps]
+            return [leaf for leaf in given if leaf is not None]
+
+        return jax.vjp(found, trainable)[1]
+
+    kept = jax.eval_shape(backward, params["trainable"], params, batch.views)
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept)) / 1e9
 
 
 def medians(forms: Sequence[Callable[[], Any]], rounds: int) -> list[float]:

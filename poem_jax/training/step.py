@@ -29,12 +29,13 @@ from poem_jax.typing import Array, Bool, Float, Params, PRNGKeyArray
 
 Metrics = dict[str, Array]
 
-_RECOMPUTED = {
+RECOMPUTED = {
     Rematerialise.NOTHING: (),
     Rematerialise.TRUNK: (TrunkRow,),
     Rematerialise.DECODER: (DecoderRow,),
     Rematerialise.BOTH: (TrunkRow, DecoderRow),
 }
+"""Rows whose blocks compute their insides again."""
 
 
 def train_step(
@@ -130,7 +131,7 @@ def _loss_share(
         key=part.key,
         draw_key=draw_key,
         axis_name=axis_name,
-        recomputed=_RECOMPUTED[config.compute.rematerialise],
+        recomputed=RECOMPUTED[config.compute.rematerialise],
     )
     image_hw = batch.views.shape[-3:-1]
     if first_stage:

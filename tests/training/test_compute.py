@@ -16,6 +16,7 @@ from poem_jax.losses import RELEASE, Share, multi_view_losses
 from poem_jax.models.network import describe, exact_weights, forward
 from poem_jax.models.precision import cast_weights
 from poem_jax.models.presets import PRESETS
+from poem_jax.models.recompute import DecoderRow, TrunkRow
 from poem_jax.training.accumulation import Part, add_up, in_parts
 from poem_jax.training.config import (
     ComputeConfig,
@@ -32,6 +33,7 @@ from tests.small_presets import NUM_VIEWS, small
 from tests.training.conftest import HW, MICRO
 
 KEY = jax.random.key(3)
+BOTH = (TrunkRow, DecoderRow)
 HALF = ComputeConfig(precision=Precision.BFLOAT16)
 
 
@@ -237,8 +239,30 @@ def test_exact_weights_are_those_of_norms_and_read_outs():
     assert not any("hidden" in name or name.endswith("conv.kernel") for name in names)
 
 
+def test_less_is_kept_for_the_backward_pass(micro_batch):
+    """By what JAX carries from the forward pass to the backward one: 17.1, 3.5 and 1.9 MB. XLA:CPU merges the
+    two again, so that no program for a CPU shows it."""
+    everything, of_trunk, little = (kept_bytes(micro_batch, kinds) for kinds in ((), (DecoderRow,), BOTH))
+    assert of_trunk < 0.3 * everything
+    assert little < 0.6 * of_trunk
+
+
+def kept_bytes(batch, kinds) -> int:
+    params = shapes_of(MICRO)
+
+    def found(trainable):
+        whole = {**params, "trainable": trainable}
+        root = batch.joints_world[:, 9]
+        options = {"config": MICRO, "root_world": root, "train": True, "recomputed": kinds}
+        prediction, _ = forward(whole, batch.views, batch.cameras, **options)
+        return prediction.layers_world, prediction.keypoints_px
+
+    backward = jax.eval_shape(lambda trainable: jax.vjp(found, trainable)[1], params["trainable"])
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(backward))
+
+
 @pytest.mark.slow
-def test_computing_again_saves_memory_and_changes_nothing(drawn_params, config, micro_batch):
+def test_computing_again_changes_nothing(drawn_params, config, micro_batch):
     config = learned_whole(config)
     state = create_state(drawn_params, config)
     lean = computed(config, rematerialise=Rematerialise.BOTH)
@@ -248,7 +272,6 @@ def test_computing_again_saves_memory_and_changes_nothing(drawn_params, config, 
     np.testing.assert_allclose(metrics["loss"], wanted_metrics["loss"], rtol=1e-6)
     close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7)
     jax.tree.map(close, got.params["statistics"], wanted.params["statistics"])
-    assert temporary_bytes(again) < 0.9 * temporary_bytes(kept)
 
 
 def temporary_bytes(run) -> int:
