@@ -94,7 +94,7 @@ def _data(data: DataConfig, model: ModelConfig, folder: Path, samples: int) -> D
     least = min((shape.min_views or NUM_VIEWS for shape in data.batches), default=NUM_VIEWS)
     shape = BatchShape(NUM_VIEWS, samples, None if data.mixture else min(least, NUM_VIEWS))
     mixture = None if data.mixture is None else _mixture(data.mixture, folder)
-    return replace(data, synthetic=synthetic, batches=(shape,), prefetch=1, workers=1, mixture=mixture)
+    return replace(data, synthetic=synthetic, batches=(shape,), prefetch=2, workers=1, mixture=mixture)
 
 
 def _mixture(mixture: MixtureConfig, folder: Path) -> MixtureConfig:
