@@ -60,6 +60,9 @@ def _thin(model: Any) -> Any:
     if isinstance(model.backbone, ResNetConfig):
         stages = len(model.backbone.blocks)
         smaller["backbone"] = replace(model.backbone, blocks=(1,) * stages, channels=(16,) * stages)
+    else:
+        few = {"width": 8, "stem_channels": 8, "stem_blocks": 2, "modules": (1, 1, 1), "blocks": 1}
+        smaller["backbone"] = replace(model.backbone, **few)
     if isinstance(model, Config):
         smaller["decoder"] = replace(model.decoder, num_layers=1, num_heads=2)
         smaller["basis"] = replace(model.basis, num_points=256)
