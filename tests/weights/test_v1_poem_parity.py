@@ -47,6 +47,7 @@ from poem_jax.models.vector_attention import BracketedVectorAttention
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array
 from poem_jax.weights.v1_poem_keys import hand_prefixes, unused_shapes, used_rows
+from tests.precision import as_float64
 from tests.weights.listening import Ears, Heard, listening
 from tests.weights.procedural import in_float32
 from tests.weights.v1_procedural import (
@@ -228,14 +229,10 @@ def heard_of(model: str) -> Run:
     lists[0] = lists[0][None]
     graph, state = nnx.split(released(model))
     with jax.enable_x64(True):
-        doubled = nnx.merge(graph, jax.tree.map(_as_double, state))
+        doubled = nnx.merge(graph, as_float64(state))
         frame = enter_working_frame(batch.views, batch.cameras, None, np.float64)
         found = _run_heard(doubled, batch.views, frame, stored["ball_index"], lists)
         return Run(*jax.tree.map(np.asarray, found))
-
-
-def _as_double(leaf: Array) -> Array:
-    return jnp.asarray(leaf, jnp.float64) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
 
 # What comes out.
