@@ -84,8 +84,16 @@ def close(ours: np.ndarray, theirs: np.ndarray, atol: float) -> None:
 # Final outputs, float32.
 
 
+@functools.lru_cache(maxsize=1)
+def rerun(case: Case) -> Rerun:
+    return Rerun(case.model, batch_of(case.inputs), case.stored["all_coords_preds"])
+
+
 @functools.cache
 def predicted(case: Case) -> Prediction:
+    """Sets A and D as users have it; the others in halves, the first of which is one program for all."""
+    if case.inputs not in "AD":
+        return rerun(case).unchanged.prediction
     config, params = released(case.model)
     batch = batch_of(case.inputs)
     prediction = poem_jax.apply(
@@ -103,7 +111,7 @@ def final(case: Case) -> Prediction:
 
 @functools.cache
 def resolved(case: Case) -> Run:
-    return resolve(Rerun(case.model, batch_of(case.inputs), case.stored["all_coords_preds"]))
+    return resolve(rerun(case))
 
 
 def share_within(case: Case, prediction: Prediction, block: int) -> float:
