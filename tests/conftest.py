@@ -28,8 +28,8 @@ if _CACHE not in os.environ and importlib.util.find_spec("filelock"):
     # What compiles in more than 0.2 s is compiled once a run, whichever worker or command needs it first.
     # A limit of the size makes JAX lock the folder, so that nobody reads a program half written.
     _own_cache = os.environ[_CACHE] = tempfile.mkdtemp(prefix="poem-tests-xla-")
-    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**33)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**33))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 
 def pytest_unconfigure() -> None:
