@@ -89,12 +89,13 @@ def test_the_released_rates_are_halved_once(stored):
 
 @pytest.mark.parity
 def test_the_released_recipe_follows_the_release(stored):
-    """Losses to step 70 and states to step 50 within 1e-3.
+    """Losses and rates to step 70, states to step 50 within 1e-3.
 
     The descent is unstable: accumulated gradients of norm 20 to 50, clipped to 0.1, only give directions. The
     released code itself, run again in PyTorch from parameters 1e-7 off, leaves the stored losses by 1e-3 at
     step 75 and by 1e-2 before step 100. Beyond step 70 the stored states are therefore compared one by one,
-    in the next test.
+    in the next test, and the rates with those that our own losses ask for: the best loss, so the step at
+    which they are halved, is another on another machine.
     """
     golden = stored.golden
     noise = (golden["init_pose"].reshape(16, 4) - np.array([1, 0, 0, 0])) / 0.1
@@ -102,7 +103,7 @@ def test_the_released_recipe_follows_the_release(stored):
     _, trace = run(stored.model, stored.seen, released_start(jnp.asarray(noise, jnp.float32)))
     assert float(trace.keypoint_loss[0]) == pytest.approx(0.14027, abs=1e-5)
     np.testing.assert_allclose(trace.keypoint_loss[:70], golden["reprojection_loss"][:70], rtol=1e-3)
-    np.testing.assert_allclose(trace.rates[:HALVED], golden["lr"][:HALVED], rtol=1e-6)
+    np.testing.assert_allclose(trace.rates[:70], golden["lr"][:70], rtol=1e-6)
     np.testing.assert_allclose(trace.rates, rates_of(trace.loss, ADAM_300_RELEASE), rtol=1e-6)
     for step in (1, 2, 5, 10, 20, 50):
         for ours, theirs in STATES.items():

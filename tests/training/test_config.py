@@ -68,14 +68,25 @@ def abstract_batch(config: TrainConfig) -> MultiViewBatch:
     )
 
 
-def traced_quickly_or_slow(name: str):
-    """Tracing the gradient of the paper's trunk takes about half a minute."""
-    model = open_experiment(name).model
-    marks = [pytest.mark.slow] if isinstance(model.backbone, HRNetConfig) else []
-    return pytest.param(name, marks=marks)
+def steps() -> list:
+    """One experiment of those whose steps are alike; tracing the gradient of the paper's trunk takes about
+    half a minute."""
+    alike: dict[tuple, list[str]] = {}
+    for name in EXPERIMENTS:
+        config = open_experiment(name)
+        step = (config.model, config.loss, config.training_root, config.compute, config.frozen_views)
+        alike.setdefault(step, []).append(name)
+    return [
+        pytest.param(
+            names[0],
+            id=" ".join(names),
+            marks=[pytest.mark.slow] if isinstance(model.backbone, HRNetConfig) else [],
+        )
+        for (model, *_), names in alike.items()
+    ]
 
 
-@pytest.mark.parametrize("name", [traced_quickly_or_slow(name) for name in EXPERIMENTS])
+@pytest.mark.parametrize("name", steps())
 def test_the_step_of_every_experiment_fits_its_model_and_data(name):
     """Shapes only: the next state has the form of the last, and every metric is a number."""
     config = open_experiment(name)

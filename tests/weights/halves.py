@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import nnx
 
@@ -62,6 +63,29 @@ def look(params: Params, views: Array, *, config: Config) -> tuple[ViewFeatures,
         seen = model.look(views, layers.NormMode())
     heard["uv_logits"] = [model.heat_maps.to_logits(heard["pooled"][0])]
     return seen, dict(heard)
+
+
+_IMAGES = 4
+"""Of one run of `look_in_parts`."""
+
+
+def look_in_parts(params: Params, views: np.ndarray, *, config: Config) -> ViewFeatures:
+    """Look at a few images at a time: one program for batches of any shape."""
+    batch, view = views.shape[:2]
+    images = views.reshape(batch * view, 1, *views.shape[2:])
+    missing = -len(images) % _IMAGES
+    images = np.concatenate([images, np.zeros((missing, *images.shape[1:]), images.dtype)])
+    parts = [_look(params, part, config=config) for part in np.split(images, len(images) // _IMAGES)]
+    rows = [
+        jnp.concatenate(leaves)[: batch * view] for leaves in zip(*map(jax.tree.leaves, parts), strict=True)
+    ]
+    leaves = [leaf.reshape(batch, view, *leaf.shape[2:]) for leaf in rows]
+    return jax.tree.unflatten(jax.tree.structure(parts[0]), leaves)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _look(params: Params, views: Array, *, config: Config) -> ViewFeatures:
+    return assemble(config, params).look(views, layers.NormMode())
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -45,6 +45,7 @@ from tests.weights.ties import (
     Run,
     assert_only_ties,
     assert_points_agree,
+    hang_on_ties,
     limit_m,
     resolve,
 )
@@ -72,8 +73,8 @@ CASES = [
     for name in names
 ]
 KEYPOINT_PX, REFERENCE_JOINT_M, FIRST_BLOCK_M = 1e-3, 1e-5, 1e-5
-MANY, MANY_UNDER_MESH = 0.98, 0.7
-"""Shares of points that agree if several ties end otherwise; one moves a whole mesh, if only by 0.1 mm."""
+MANY = 0.98
+"""Share of points on which two programs of ours agree, if several ties end otherwise."""
 
 
 def close(ours: np.ndarray, theirs: np.ndarray, atol: float) -> None:
@@ -83,8 +84,16 @@ def close(ours: np.ndarray, theirs: np.ndarray, atol: float) -> None:
 # Final outputs, float32.
 
 
+@functools.lru_cache(maxsize=1)
+def rerun(case: Case) -> Rerun:
+    return Rerun(case.model, batch_of(case.inputs), case.stored["all_coords_preds"])
+
+
 @functools.cache
 def predicted(case: Case) -> Prediction:
+    """Sets A and D as users have it; the others in halves, the first of which is one program for all."""
+    if case.inputs not in "AD":
+        return rerun(case).unchanged.prediction
     config, params = released(case.model)
     batch = batch_of(case.inputs)
     prediction = poem_jax.apply(
@@ -102,7 +111,7 @@ def final(case: Case) -> Prediction:
 
 @functools.cache
 def resolved(case: Case) -> Run:
-    return resolve(Rerun(case.model, batch_of(case.inputs), case.stored["all_coords_preds"]))
+    return resolve(rerun(case))
 
 
 def share_within(case: Case, prediction: Prediction, block: int) -> float:
@@ -232,10 +241,13 @@ def test_what_is_resolved_are_ties(case: Case) -> None:
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_share_of_points_before_ties_are_resolved(case: Case) -> None:
-    many = MANY_UNDER_MESH if case.model == PARAMETRIC else MANY
+def test_what_is_off_before_ties_are_resolved_hangs_on_them(case: Case) -> None:
+    """How many points are off is a matter of the machine's rounding; that the others are not, is not."""
+    off = distances(case, predicted(case), 2) > limit_m(case.model, 2)
+    if final(case) is not predicted(case):
+        off &= ~hang_on_ties(resolved(case), case.model)
     assert share_within(case, predicted(case), 1) >= SHARE
-    assert share_within(case, predicted(case), 2) >= many
+    assert np.mean(off) <= 1 - SHARE
     assert distances(case, predicted(case), 2).max() <= FARTHEST_M
 
 

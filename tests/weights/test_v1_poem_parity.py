@@ -21,7 +21,6 @@ import pytest
 from flax import nnx
 
 from poem_jax.batch import MultiViewBatch, Prediction
-from poem_jax.geometry.cameras import Cameras
 from poem_jax.geometry.neighbours import nearest
 from poem_jax.hand.model import template_queries
 from poem_jax.hand.topology import WRIST
@@ -47,6 +46,7 @@ from poem_jax.models.vector_attention import BracketedVectorAttention
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array
 from poem_jax.weights.v1_poem_keys import hand_prefixes, unused_shapes, used_rows
+from tests.precision import as_float64
 from tests.weights.listening import Ears, Heard, listening
 from tests.weights.procedural import in_float32
 from tests.weights.v1_procedural import (
@@ -182,9 +182,23 @@ def released(name: str) -> PoemV1:
     return model
 
 
+class Start(NamedTuple):
+    """Where the second stage starts."""
+
+    queries: Array
+    centre: Array
+    in_ball: Array
+    """How many grid points the ball about the centre holds."""
+
+
 @nnx.jit
-def _run(model: PoemV1, views: Array, frame: WorkingFrame, ball_index: Array) -> Prediction:
-    return model.find_hands(model.look(views, NormMode()), frame, NormMode(), ball_index=ball_index)
+def _run(model: PoemV1, views: Array, frame: WorkingFrame, ball_index: Array) -> tuple[Prediction, Start]:
+    with listening({name: HEARD[name] for name in ("grid", "start")}) as heard:
+        prediction = model.find_hands(model.look(views, NormMode()), frame, NormMode(), ball_index=ball_index)
+    start, grid = heard["start"][0], heard["grid"][0]
+    points = grid.reshape(*views.shape[:2], -1, 3)
+    inside = jnp.sum(in_ball(model.config.basis, points, start.centre), (1, 2))
+    return prediction, Start(start.queries, start.centre, inside)
 
 
 @nnx.jit
@@ -205,14 +219,18 @@ def _run_heard(
     return prediction, dict(heard)
 
 
-def run(name: str, batch: MultiViewBatch, ball_index: np.ndarray) -> Prediction:
+def run(name: str, batch: MultiViewBatch, ball_index: np.ndarray) -> tuple[Prediction, Start]:
     frame = enter_working_frame(batch.views, batch.cameras, None, np.float32)
     return jax.tree.map(np.asarray, _run(released(name), batch.views, frame, ball_index))
 
 
 @functools.cache
-def ran(case: Case) -> Prediction:
+def _ran(case: Case) -> tuple[Prediction, Start]:
     return run(case.model, batch_of(case.inputs), case.stored["ball_index"])
+
+
+def ran(case: Case) -> Prediction:
+    return _ran(case)[0]
 
 
 SEARCHES = ("knn/pts_self_s0", "knn/query_self_0", "knn/query_cross_0")
@@ -228,14 +246,10 @@ def heard_of(model: str) -> Run:
     lists[0] = lists[0][None]
     graph, state = nnx.split(released(model))
     with jax.enable_x64(True):
-        doubled = nnx.merge(graph, jax.tree.map(_as_double, state))
+        doubled = nnx.merge(graph, as_float64(state))
         frame = enter_working_frame(batch.views, batch.cameras, None, np.float64)
         found = _run_heard(doubled, batch.views, frame, stored["ball_index"], lists)
         return Run(*jax.tree.map(np.asarray, found))
-
-
-def _as_double(leaf: Array) -> Array:
-    return jnp.asarray(leaf, jnp.float64) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
 
 # What comes out.
@@ -271,35 +285,17 @@ def check_injected(case: Case, key: str) -> None:
     assert all(len(set(row)) == draw.num_points for row in index)
 
 
-@functools.cache
-def starts(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return first query points, centres of the balls, and how many grid points these hold."""
-    model, batch = released(case.model), batch_of(case.inputs)
-    frame = enter_working_frame(batch.views, batch.cameras, None, np.float32)
-
-    @nnx.jit
-    def run(model: PoemV1, views: Array, frame: WorkingFrame) -> tuple[Array, Array, Array]:
-        start = model.start(model.look(views, NormMode()), frame)
-        config, cams = model.config, Cameras(*map(jnp.asarray, frame.cams))
-        grid = poem_v1.frustum_grid(config.basis.frustum, cams, config.map_hw, config.image_hw)
-        points = grid.reshape(*cams.K.shape[:2], -1, 3)
-        return start.queries, start.centre, jnp.sum(in_ball(config.basis, points, start.centre), (1, 2))
-
-    found = run(model, batch.views, frame)
-    return tuple(map(np.asarray, found))  # pyright: ignore[reportReturnType]
-
-
 def check_first_queries(case: Case, key: str) -> None:
-    np.testing.assert_allclose(starts(case)[0], case.stored[key], atol=JOINT_M)
+    np.testing.assert_allclose(_ran(case)[1].queries, case.stored[key], atol=JOINT_M)
 
 
 def check_centre(case: Case, key: str) -> None:
-    np.testing.assert_allclose(starts(case)[1], case.stored[key], atol=JOINT_M)
+    np.testing.assert_allclose(_ran(case)[1].centre, case.stored[key], atol=JOINT_M)
 
 
 def check_count(case: Case, key: str) -> None:
     """Rounding may put points of the surface on either side."""
-    np.testing.assert_allclose(starts(case)[2], case.stored[key], atol=EDGE)
+    np.testing.assert_allclose(_ran(case)[1].in_ball, case.stored[key], atol=EDGE)
 
 
 @functools.cache
@@ -507,5 +503,5 @@ def test_masked_views_change_nothing(name: str) -> None:
     assert draw is not None
     index, size = golden(f"{name}_a")["ball_index"], draw.points_per_view
     moved = (np.array(PLACES)[index // size] * size + index % size).astype(np.int32)
-    masked = run(name, amid_garbage(batch_of("a")), moved)
+    masked, _ = run(name, amid_garbage(batch_of("a")), moved)
     assert_within_gates(masked.layers_world, ran(Case(name, "a")).layers_world)

@@ -6,6 +6,7 @@ query by up to 5 mm, those that read it later by less, and all vertices of the p
 stored float32 runs differ in this way from the stored float64 runs, and our own programs from each other.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models.world_frame import enter_working_frame
-from tests.weights.halves import find_hands, look
+from tests.weights.halves import find_hands, look_in_parts
 from tests.weights.procedural import known_root, released
 
 PARAMETRIC = "medium_MANO"
@@ -52,7 +53,7 @@ class Rerun:
         """`stored`: the points of all blocks of the run to compare with."""
         self.model, self.batch, self.stored = model, batch, stored
         self.config, self.params = released(model)
-        self.seen, _ = look(self.params, batch.views, config=self.config)
+        self.seen = look_in_parts(self.params, batch.views, config=self.config)
         root = known_root(batch) if root_world is None else root_world
         self.frame = enter_working_frame(batch.views, batch.cameras, root, np.float32)
 
@@ -61,13 +62,18 @@ class Rerun:
         found = jax.tree.map(np.asarray, (prediction, gaps, heard["neighbours"]))
         return Run(found[0], found[1], np.stack(found[2]), swapped)
 
+    @functools.cached_property
+    def unchanged(self) -> Run:
+        """The run with all ties as they fall."""
+        return self(np.zeros((4, len(self.stored), NUM_QUERIES), bool))
+
     def distances(self, run: Run, block: int) -> np.ndarray:
         return np.linalg.norm(run.prediction.layers_world[:, block] - self.stored[:, block], axis=-1)
 
 
 def resolve(rerun: Rerun) -> Run:
     """Swap the ties of the queries that are off, block by block."""
-    run = rerun(np.zeros((4, len(rerun.stored), NUM_QUERIES), bool))
+    run = rerun.unchanged
     for block, searches in SEARCHES.items():
         if rerun.model == PARAMETRIC and block == 2:
             return _resolve_under_mesh(rerun, run)
@@ -97,6 +103,21 @@ def _resolve_under_mesh(rerun: Rerun, run: Run) -> Run:
         kept = np.where((trial < error)[:, None], swapped, kept)
         error = np.minimum(trial, error)
     return rerun(kept)
+
+
+def hang_on_ties(run: Run, model: str) -> np.ndarray:
+    """Say which points (batch, query) of the last block another end of the swapped searches may move.
+
+    Those are the queries whose own search was swapped, and those that read a query moved in the block before;
+    of the parametric model all, since its mesh hangs on every query.
+    """
+    own = run.swapped.any(0)
+    if model == PARAMETRIC:
+        return np.broadcast_to(own.any(-1, keepdims=True), own.shape)
+    moved = run.swapped[SEARCHES[1]].any(0)
+    among_queries = run.index[SEARCHES[2]][1]
+    reads_moved = np.stack([row[index].any(-1) for row, index in zip(moved, among_queries, strict=True)])
+    return own | reads_moved
 
 
 def assert_only_ties(run: Run) -> None:
