@@ -36,7 +36,8 @@ class Train:
     mano: OptionalFile = None
     """MANO_RIGHT.pkl, for --data that need it."""
     export: OptionalFolder = None
-    """Write the averaged weights of the newest checkpoint there as a model, and train nothing."""
+    """Write the averaged weights of the newest checkpoint (with --train.keep-best: of the best one) there as a
+    model, and train nothing."""
     smoke: Flag = False
     """Try the experiment: two steps of a tiny model on stand-ins of its data, in a folder that is removed."""
     hosts: Annotated[Literal["auto"] | None, tyro.conf.arg(metavar="auto")] = None
@@ -121,7 +122,7 @@ class Train:
 
         assert self.export is not None
         check_folder_is_writable(self.export, "--export")
-        say(f"reading the newest checkpoint in {config.train.out}")
+        say(f"reading a checkpoint in {config.train.out}")
         step = export_run(config, self.export)
         print(f"wrote the weights of step {step} to {self.export}")
 
