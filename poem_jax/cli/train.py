@@ -36,8 +36,8 @@ class Train:
     mano: OptionalFile = None
     """MANO_RIGHT.pkl, for --data that need it."""
     export: OptionalFolder = None
-    """Write the averaged weights of the newest checkpoint (with --train.keep-best: of the best one) there as a
-    model, and train nothing."""
+    """Write the averaged weights of the newest checkpoint there as a model (with --train.keep-best, of the
+    best one), and train nothing."""
     smoke: Flag = False
     """Try the experiment: two steps of a tiny model on stand-ins of its data, in a folder that is removed."""
     hosts: Annotated[Literal["auto"] | None, tyro.conf.arg(metavar="auto")] = None
