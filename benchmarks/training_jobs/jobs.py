@@ -14,7 +14,16 @@ from poem_jax.models import layers
 from poem_jax.training.hosts import start_hosts
 from poem_jax.training.parallel import compile_step, data_mesh, put_batch
 from poem_jax.training.source import drawing_threads, synthetic_batches
-from training_jobs.steps import COMPUTE, experiment, forget_peak, fresh_state, medians, peak_gb, stepper
+from training_jobs.steps import (
+    COMPUTE,
+    experiment,
+    forget_peak,
+    fresh_state,
+    kept_gb,
+    medians,
+    peak_gb,
+    stepper,
+)
 
 
 def time_gradients(name: str, samples: int, views: int, rounds: int, thin: bool) -> list[float]:
