@@ -147,7 +147,7 @@ def _sit(arguments: list[str], log: str, program: str, blow: dict | None, larges
     """Be a sitting; this never returns."""
     from poem_jax.cli.run import main
 
-    said = os.open(log, os.O_WRONLY | os.O_CREAT)
+    said = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for number in (1, 2):
         os.dup2(said, number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -156,7 +156,8 @@ def _sit(arguments: list[str], log: str, program: str, blow: dict | None, larges
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
     if blow is not None:
         Blow(**blow).await_it()
-    sys.exit(main(["train", *arguments]))
+    sys.argv = ["poem", "train", *arguments]
+    sys.exit(main(sys.argv[1:]))
 
 
 def _trace_once(program: Path) -> None:

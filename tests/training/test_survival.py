@@ -91,9 +91,9 @@ def journal(run: Path) -> list[dict[str, Any]]:
 def blows(run: Path) -> list[Blow]:
     """Draw twenty moments: inside the write of a checkpoint, between it and its checksums, and anywhere."""
     rng = np.random.default_rng(20)
-    moments = [Blow(TORN, int(rng.integers(1, 12))) for _ in range(6)]
+    moments = [Blow(f"{TORN}/", int(rng.integers(1, 14))) for _ in range(6)]
     moments += [Blow(f"{run}/seals/", 1) for _ in range(2)]
-    moments += [Blow(f"{run}/", int(rng.integers(1, 150)), rng.exponential(0.1)) for _ in range(12)]
+    moments += [Blow(f"{run}/", int(rng.integers(1, 110)), rng.exponential(0.1)) for _ in range(12)]
     return [moments[i] for i in rng.permutation(BLOWS)]
 
 
