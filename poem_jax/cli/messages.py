@@ -24,8 +24,12 @@ def say(text: str) -> None:
 def called_as() -> str:
     """Return the command line of this process, as it can be given again: `poem train ...`, or the script."""
     program, *arguments = sys.argv
-    is_script = program.endswith(".py")
-    return shlex.join([*(["python", program] if is_script else [Path(program).name]), *arguments])
+    if Path(program).name == "__main__.py":
+        # By its path, the file's folder would come first in the search, with modules named as Python's own.
+        started = ["python", "-m", "poem_jax.cli"]
+    else:
+        started = ["python", program] if program.endswith(".py") else [Path(program).name]
+    return shlex.join([*started, *arguments])
 
 
 def set_up_logging() -> None:

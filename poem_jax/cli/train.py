@@ -109,8 +109,10 @@ class Train:
         start_hosts(*named)
 
     def _train(self, config: "TrainConfig") -> None:
+        from poem_jax.training.finetune import check_captures
         from poem_jax.training.loop import train
 
+        check_captures(config)
         out, steps = config.train.out, config.train.steps
         with tells_what_is_left(Path(out)):
             state = train(config, command=called_as())

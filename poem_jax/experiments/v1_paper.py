@@ -22,6 +22,7 @@ Command:   poem train v1_paper
 from poem_jax.data.augmentation_recipes import PAPER
 from poem_jax.experiments.parts.single_sets import on_one_set
 from poem_jax.models.presets import preset
+from poem_jax.training.config import TrainConfig
 
 _SETS_OF_MODELS = {
     **dict.fromkeys(("v1", "mvp", "pe-meshtr", "ftl-meshtr", "v1-wo-proj"), ("dexycb", "oakink", "ho3d")),
@@ -30,11 +31,15 @@ _SETS_OF_MODELS = {
     "v1-g-emb": ("oakink",),
     "v1-gv-emb": ("oakink",),
 }
+
+
+def _on(name: str, model: str, dataset: str) -> TrainConfig:
+    return on_one_set(name, preset(model), dataset, PAPER, epochs=100, drop_epoch=70, batch_size=16)
+
+
 configs = {
-    f"{model}-{dataset}": on_one_set(
-        f"v1_paper_{model}-{dataset}", preset(model), dataset, PAPER, epochs=100, batch_size=16
-    )
+    f"{model}-{dataset}": _on(f"v1_paper_{model}-{dataset}", model, dataset)
     for model, datasets in _SETS_OF_MODELS.items()
     for dataset in datasets
 }
-config = on_one_set("v1_paper", preset("v1"), "dexycb", PAPER, epochs=100, batch_size=16)
+config = _on("v1_paper", "v1", "dexycb")

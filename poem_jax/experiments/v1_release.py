@@ -24,6 +24,7 @@ def _on(name: str, model: str, dataset: str) -> TrainConfig:
         dataset,
         RELEASE_V1,
         epochs=100 if (model, dataset) == ("pe-meshtr", "dexycb") else 101,
+        drop_epoch=32 if model == "ftl-meshtr" else 70,
         batch_size=16 if dataset == "ho3d" else 32,
     )
 

@@ -1,9 +1,11 @@
 """An experiment turned to another model or other data: what `poem train --init` and `--data` do."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from poem_jax.data.capture_folder import RIG_FILES, find_rig_file
 from poem_jax.mixture.config import CapturesSource, FramesSource, MixtureConfig, Part, SyntheticSource
 from poem_jax.mixture.recognise import Kind, recognise, source_at
 from poem_jax.models.config import ModelConfig
@@ -94,6 +96,25 @@ def train_on(config: TrainConfig, paths: Sequence[str | Path], *, mano: Path | N
     weight = (sum(part.weight for part in parts) - sum(part.weight for part in kept)) / len(sources)
     new = tuple(Part(source, weight, like.views, like.held_out) for source in sources)
     return replace(config, data=replace(data, mixture=replace(mixture, parts=(*new, *kept))))
+
+
+def check_captures(config: TrainConfig) -> None:
+    """Raise where an experiment names captures that are not there, as `finetune` does by itself.
+
+    Raises:
+        FileNotFoundError: no folder, or none with a rig.
+    """
+    parts = () if config.data.mixture is None else config.data.mixture.parts
+    named = [part.source.folders for part in parts if isinstance(part.source, CapturesSource)]
+    for folder in itertools.chain(*named):
+        try:
+            find_rig_file(folder)
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{config.name} trains on the capture in {folder}, and there is none: give --data DIR ..., "
+                f"your captures, each a folder with {' or '.join(RIG_FILES)}, images, and labels, which "
+                "`poem fit` makes"
+            ) from None
 
 
 def _with_views(data: DataConfig, model: ModelConfig, cameras: int) -> DataConfig:

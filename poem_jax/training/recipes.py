@@ -103,7 +103,7 @@ V1_RECIPES = (
     _with_steps("mvp-release", losses.MVP, 70 / 101, Clip.PER_TENSOR),
 )
 """POEM v1 (also its ablations of two stages), and the baselines. The paper does not mention clipping; its
-recipes clip as `paper` does."""
+recipes clip as `paper` does. Where one data set has another number of epochs, its experiment says so."""
 SYNTHETIC_RECIPE = Recipe(
     "synthetic",
     losses.SYNTHETIC,

@@ -1,6 +1,8 @@
 """The options of `poem train`: its own, and those of the experiment."""
 
+import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -9,7 +11,8 @@ from poem_jax.cli.train import Train, override
 from poem_jax.experiments import open_experiment
 from poem_jax.miniatures import captures
 
-TINY = open_experiment("tiny_synthetic")
+TINY, FINETUNE = open_experiment("tiny_synthetic"), open_experiment("finetune")
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 
 
 def test_overrides_are_typed_and_unknown_ones_fail():
@@ -62,6 +65,22 @@ def test_the_experiment_is_turned_before_its_fields_are_given(tmp_path):
 def test_options_that_do_not_go_together_are_refused(options, what):
     with pytest.raises(ValueError, match=what):
         parse(["train", "v2_small_synthetic", *options]).run()
+
+
+def test_fine_tuning_without_a_capture_asks_for_data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"on the capture in capture, .* give --data DIR"):
+        parse(["train", "finetune"]).run()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_options_that_the_guide_to_fine_tuning_names_can_be_given():
+    table = GUIDE.read_text().split("## Fine-tune on your own rig")[1].split("| change | option |")[1]
+    rows = [row for row in table.split("\n\n")[0].splitlines() if "`" in row]
+    assert len(rows) > 4
+    for row in rows:
+        options = row.split("`")[1]
+        assert override(FINETUNE, shlex.split(options)) != FINETUNE, options
 
 
 def test_help_of_an_experiment_lists_its_fields(capsys):

@@ -1,6 +1,7 @@
 """Experiments: those of the package by name, others by path, and the doors in `configs/`."""
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,8 @@ import pytest
 from poem_jax import experiments
 from poem_jax.experiments import experiment_names, open_experiment
 from poem_jax.experiments.synthetic_benchmark import benchmark
-from poem_jax.training.config import TrainConfig
+from poem_jax.models.presets import PRESETS
+from poem_jax.training.config import Schedule, TrainConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(experiments.__file__).parent
@@ -48,6 +50,33 @@ def test_each_of_several_experiments_opens_behind_a_colon_and_keeps_to_its_own_f
     assert len(set(folders)) == len(folders)
     assert all(config.train.out == f"runs/{config.name}" for config in opened)
     assert open_experiment(f"{ROOT}/configs/{name}.py:{next(iter(several))}") == opened[0]
+
+
+def test_released_recipes_of_one_set_drop_the_rate_after_the_same_epoch():
+    """Whether 100 or 101 epochs follow."""
+    for which, config in configs_of("v1_release").items():
+        model, _, dataset = which.rpartition("-")
+        epochs = 100 if which == "pe-meshtr-dexycb" else 101
+        assert config.train.steps % epochs == 0
+        drop = config.optimizer.drop_at * epochs
+        assert drop == pytest.approx(32 if model == "ftl-meshtr" else 70), (which, dataset)
+
+
+def test_every_released_model_of_poem_v2_has_its_recipe_on_the_six_sets():
+    medium, others = open_experiment("v2_medium_six_sets"), configs_of("v2_medium_six_sets")
+    released = {name for name in PRESETS if name.startswith("v2-") and name.endswith("-release")}
+    assert others.keys() | {"v2-medium-release"} == released
+    assert medium.model == PRESETS["v2-medium-release"]
+    assert medium.optimizer.schedule is Schedule.STEP
+    for name, config in others.items():
+        assert config.model == PRESETS[name]
+        parametric = "mano" in name
+        assert config.data.mixture.pose == parametric
+        schedule = Schedule.COSINE if parametric else Schedule.STEP
+        assert config.optimizer == replace(medium.optimizer, schedule=schedule)
+        assert (config.loss, config.training_root) == (medium.loss, medium.training_root)
+        views = [[part.views for part in of.data.mixture.parts] for of in (config, medium)]
+        assert views[0] == views[1]
 
 
 def test_configs_has_no_door_to_nothing():

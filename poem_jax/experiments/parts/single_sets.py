@@ -16,7 +16,14 @@ from poem_jax.training.recipes import experiment, recipe_of
 
 
 def on_one_set(
-    name: str, model: ModelConfig, dataset: str, recipe: Recipe, *, epochs: int, batch_size: int
+    name: str,
+    model: ModelConfig,
+    dataset: str,
+    recipe: Recipe,
+    *,
+    epochs: int,
+    drop_epoch: int,
+    batch_size: int,
 ) -> TrainConfig:
     """Return a system's recipe on one data set with all its cameras.
 
@@ -26,12 +33,14 @@ def on_one_set(
         dataset: "dexycb", "oakink" or "ho3d".
         recipe: of augmentation.
         epochs: whole ones, of whole batches.
+        drop_epoch: after how many of them the rate becomes a tenth.
         batch_size: samples of a step.
     """
     of = SETS[dataset]
     model = _made_for(model, dataset, of.most_views)
+    by = recipe_of(model)
     return experiment(
-        recipe_of(model).name,
+        by.name,
         name=name,
         model=model,
         data=replace(
@@ -45,6 +54,7 @@ def on_one_set(
             out=f"runs/{name}",
             validation_views=(of.most_views,),
         ),
+        optimizer=replace(by.optimizer, drop_at=drop_epoch / epochs),
     )
 
 

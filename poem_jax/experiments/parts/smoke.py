@@ -1,7 +1,8 @@
 """An experiment at a size that runs in seconds on a CPU: two steps of a thin model on stand-ins of its data.
 
-It goes through all that the real one goes through: readers, augmentation, workers, loss, checkpoints,
-validation. It says that the experiment starts, and nothing of how well it learns.
+It goes through the code that the real one goes through: readers, augmentation, workers, loss, checkpoints,
+validation, pictures. It says that the experiment starts, and nothing of how well it learns, how much memory
+it takes, or whether the files of its data are sound: it reads none of them.
 """
 
 from dataclasses import replace
@@ -9,6 +10,9 @@ from pathlib import Path
 
 import jax
 
+from poem_jax.data.released_sets import of_split
+from poem_jax.data.shards import expand_shards
+from poem_jax.data.tar_labels import convention_of
 from poem_jax.experiments.parts.small_models import NUM_VIEWS, small, with_joint_decoder
 from poem_jax.miniatures import captures, released_tars
 from poem_jax.miniatures.mano_stand_in import write_mano
@@ -50,6 +54,10 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
     Args:
         config: the experiment.
         folder: empty; gets stand-ins of the data sets, weights to start from, and the run.
+
+    Raises:
+        ValueError: tars whose names say no data set.
+        FileNotFoundError: a folder or a pattern with `*` that stands for no tar.
     """
     model = small(config.model)
     if isinstance(model, Config) and model.joint_decoder is not None:
@@ -72,6 +80,7 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
             checkpoint_every=1,
             keep_best=train.keep_best,
             skip_bad_steps=train.skip_bad_steps,
+            panel_every=STEPS if train.panel_every else 0,
             validate_every=STEPS if train.validate_every else 0,
             validation_samples=2,
             validation_views=(NUM_VIEWS,),
@@ -120,7 +129,8 @@ def _stand_in(source: AnySource, folder: Path, mano: str) -> AnySource:
         captures.write(folder / "capture")
         return CapturesSource((str(folder / "capture"),))
     if isinstance(source, ReleasedTarsSource):
-        name = next(name for name in released_tars.KINDS if name in source.paths[0].lower())
+        shard = of_split(expand_shards(source.paths), source.split)[0]
+        name = convention_of(shard.name).name.lower()
         WRITERS[f"tars-{name}"](folder / "tars")
         shards = f"{folder}/tars/{released_tars.KINDS[name].train}-{{000000..000001}}.tar"
         return ReleasedTarsSource((shards,), mano=mano if source.mano else None)
