@@ -51,7 +51,7 @@ class Journal:
             disable=not config.train.progress,
             mininterval=0.1 if sys.stderr.isatty() else _LOG_FILE_S,
         )
-        self._board = _tensorboard(run_dir) if config.train.tensorboard else None
+        self._board = _tensorboard(run_dir, first_step) if config.train.tensorboard else None
 
     def __enter__(self) -> "Journal":
         return self
@@ -106,13 +106,15 @@ def read_entries(file: Path) -> list[dict[str, Any]]:
 def forget_after(file: Path, step: int) -> None:
     """Drop the lines of a metrics file that a run going on from `step` will write again, and broken ones.
 
-    A run that was killed has written beyond its newest checkpoint, and maybe half a line.
+    A run that was killed has written beyond its newest checkpoint, and maybe half a line. One that begins at
+    step 0 writes all again, what it measured before its first step too.
     """
     if not file.exists():
         return
     text = file.read_text(encoding="utf-8", errors="replace")
     lines = text.splitlines(keepends=True)
-    kept = "".join(line for line in lines if (entry := _entry(line)) is not None and entry["step"] <= step)
+    last = step if step > 0 else -1
+    kept = "".join(line for line in lines if (entry := _entry(line)) is not None and entry["step"] <= last)
     if kept != text:
         with whole_file(file) as temporary:
             temporary.write_text(kept, encoding="utf-8")
@@ -128,7 +130,10 @@ def _entry(line: str) -> dict[str, Any] | None:
     return entry if is_metrics else None
 
 
-def _tensorboard(run_dir: Path) -> Any:
+def _tensorboard(run_dir: Path, first_step: int) -> Any:
+    """Open the writer; what was sent of the steps that a run takes again is hidden."""
     from tensorboardX import SummaryWriter  # pyright: ignore[reportMissingImports]
 
-    return SummaryWriter(str(run_dir / "tensorboard"))
+    folder = run_dir / "tensorboard"
+    again = {"purge_step": first_step + 1 if first_step else 0} if folder.exists() else {}
+    return SummaryWriter(str(folder), **again)

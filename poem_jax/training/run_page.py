@@ -54,7 +54,12 @@ _PLOTS = (
     _Plot(
         "Other errors, held out",
         "mm",
-        lambda group, name: group == "validation" and not name.startswith("mpvpe_mm"),
+        lambda group, name: group == "validation" and not name.startswith(("mpvpe_mm", "unsolved_share")),
+    ),
+    _Plot(
+        "Not solved, held out",
+        "share of the samples",
+        lambda group, name: group == "validation" and name.startswith("unsolved_share"),
     ),
     _Plot("Learning rate", "rate", _train("learning_rate")),
     _Plot("Gradient", "norm", _train("gradient_norm"), True),

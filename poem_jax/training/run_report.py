@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -62,9 +63,9 @@ def reported(sitting: Sitting) -> Iterator[None]:
         end = f"stopped by {name}" if stopped else f"failed: {type(error).__name__}: {error}"
         try:
             _write(sitting, end)
-        except OSError as problem:
-            # What ended the run matters more.
-            log.warning("the report of the run cannot be written: %s", problem)
+        except Exception as problem:
+            # What ended the run matters more, whatever is wrong with the report.
+            log.warning("the report of the run cannot be written: %r", problem)
         raise
     finished = sitting.step >= sitting.config.train.steps
     _write(sitting, "finished" if finished else "the time of `train.max_minutes` was over")
@@ -78,7 +79,8 @@ def _write(sitting: Sitting, end: str) -> None:
     report = summary(sitting, end, entries)
     panels = sorted((run_dir / PANELS).glob("*.png"))
     with whole_file(run_dir / REPORT) as file:
-        file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        text = json.dumps(_in_json(report), indent=1, allow_nan=False)
+        file.write_text(text + "\n", encoding="utf-8")
     with whole_file(run_dir / PAGE) as file:
         text = page(sitting.config.name, _facts(report), entries, panels[-1] if panels else None)
         file.write_text(text, encoding="utf-8")
@@ -126,9 +128,19 @@ def _best(validation: Sequence[Entry]) -> dict[str, dict[str, float]]:
     best: dict[str, dict[str, float]] = {}
     for entry in validation:
         for name, value in entry.items():
-            if name.startswith("mpvpe_mm") and (name not in best or value < best[name]["value"]):
+            is_error = name.startswith("mpvpe_mm") and math.isfinite(value)
+            if is_error and (name not in best or value < best[name]["value"]):
                 best[name] = {"value": value, "step": entry["step"]}
     return best
+
+
+def _in_json(value: Any) -> Any:
+    """Replace numbers that are not finite by None: JSON has none of them."""
+    if isinstance(value, Mapping):
+        return {name: _in_json(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_in_json(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _facts(report: Mapping[str, Any]) -> dict[str, str]:

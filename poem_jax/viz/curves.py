@@ -15,6 +15,10 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 20, 10, 42
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#7f7f7f")
 """Tell apart also by those who see fewer colours (Okabe and Ito, 2008)."""
 _MOST_POINTS = 300
+_LARGEST = 1e300
+"""Values beyond it are drawn there, and those below its inverse at 0: ranges and sums stay finite."""
+_LEAST_RANGE = 1e-12
+"""Of the values, relative to their size; narrower ones are drawn as a constant."""
 _LOG_FROM = 30.0
 """The largest value over the smallest from which an axis of positive values may be logarithmic."""
 
@@ -76,7 +80,7 @@ class _Axis(NamedTuple):
         low, high = float(values.min()), float(values.max())
         if log:
             return _Axis(low, high, True, _decades(low, high))
-        if low == high:
+        if high - low <= _LEAST_RANGE * max(-low, high):
             low, high = min(0.0, 2 * low), max(0.0, 2 * high) or float(low == 0)
         step = _round_up((high - low) / 5)
         low = math.floor(low / step + 1e-9) * step
@@ -108,7 +112,8 @@ def _round_up(step: float) -> float:
 def _finite(curve: Curve) -> Curve:
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
     kept = np.isfinite(x) & np.isfinite(y)
-    return Curve(curve.name, x[kept], y[kept])
+    y = np.clip(y[kept], -_LARGEST, _LARGEST)
+    return Curve(curve.name, x[kept], np.where(np.abs(y) < 1 / _LARGEST, 0.0, y))
 
 
 def _thinned(curve: Curve) -> Curve:
@@ -156,13 +161,13 @@ def _labels(x_label: str, y_label: str) -> str:
 
 
 def _short(value: float) -> str:
-    """Write a tick: 0, 0.25, 1500, 20k, 2M, 1e-4."""
+    """Write a tick: 0, 0.25, 1500, 20k, 2M, 1e-4, 1e12."""
+    if not 1e-3 <= abs(value) < 1e9 and value != 0:
+        mantissa, _, exponent = f"{value:.3e}".partition("e")
+        return f"{float(mantissa):g}e{int(exponent)}"
     for size, letter in ((1e6, "M"), (1e4, "k")):
         if abs(value) >= size:
             return f"{value / (1e6 if letter == 'M' else 1e3):.4g}{letter}"
-    if 0 < abs(value) < 1e-3:
-        mantissa, _, exponent = f"{value:.3e}".partition("e")
-        return f"{float(mantissa):g}e{int(exponent)}"
     # What floating point makes of 3 x 0.1.
     return f"{round(value, 9):.5g}"
 

@@ -54,11 +54,23 @@ def test_a_whole_file_is_left_alone(tmp_path):
     assert (file.stat().st_mtime_ns, file.stat().st_ino) == before
 
 
+def test_a_run_that_begins_anew_measures_its_start_anew(tmp_path):
+    """A sitting that goes on does not."""
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"step": 0}\n{"step": 2}\n')
+    forget_after(file, 2)
+    assert steps(file) == [0, 2]
+    forget_after(file, 0)
+    assert steps(file) == []
+
+
 class Board:
     """Stands for TensorBoard's writer."""
 
-    def __init__(self, folder):
-        self.folder, self.scalars, self.images, self.closed = folder, {}, {}, False
+    def __init__(self, folder, purge_step=None):
+        self.folder, self.purge_step = Path(folder), purge_step
+        self.folder.mkdir(exist_ok=True)
+        self.scalars, self.images, self.closed = {}, {}, False
 
     def add_scalar(self, name, value, step):
         self.scalars[name, step] = value
@@ -74,8 +86,8 @@ class Board:
 def test_numbers_and_pictures_arrive_everywhere(micro_config, tmp_path, monkeypatch, capsys):
     boards = []
 
-    def open_board(folder):
-        boards.append(Board(folder))
+    def open_board(folder, **options):
+        boards.append(Board(folder, **options))
         return boards[-1]
 
     monkeypatch.setitem(sys.modules, "tensorboardX", SimpleNamespace(SummaryWriter=open_board))
@@ -87,7 +99,12 @@ def test_numbers_and_pictures_arrive_everywhere(micro_config, tmp_path, monkeypa
         journal.write(2, {"mpvpe_mm_2views": 7.0}, group="validation")
         journal.image(2, "held_out", Path("panels") / "step_2.png", picture)
         journal.advance(3)
-    (board,) = boards
+    for first_step in (4, 0):
+        with Journal(tmp_path, config, first_step):
+            pass
+    board = boards[0]
+    # What TensorBoard has from there on will be sent again.
+    assert [board.purge_step for board in boards] == [None, 5, 0]
     assert board.scalars[("train/gradient_norm", 2)] == 3
     assert board.scalars[("validation/mpvpe_mm_2views", 2)] == 7
     np.testing.assert_array_equal(board.images["held_out", 2], picture)

@@ -104,6 +104,36 @@ def test_a_report_that_cannot_be_written_hides_no_error(run, caplog):
         pass
 
 
+def test_a_page_that_cannot_be_drawn_hides_no_error(run, monkeypatch, caplog):
+    def broken(*_):
+        raise ZeroDivisionError("an axis")
+
+    monkeypatch.setattr(run_report, "page", broken)
+    with pytest.raises(FloatingPointError, match="loss"), reported(run):
+        raise FloatingPointError("loss")
+    assert "cannot be written: ZeroDivisionError('an axis')" in caplog.text
+    assert report(run)["end"] == "failed: FloatingPointError: loss"
+
+
+def test_numbers_that_are_not_finite_are_null_in_the_report(run):
+    line = {"step": 3, "mpvpe_mm_2views": float("nan"), "mpvpe_mm_new": float("inf")}
+    with (Path(run.config.train.out) / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps({"group": "validation"} | line) + "\n")
+        file.write(json.dumps({"group": "train", "step": 3, "loss": float("nan")}) + "\n")
+    with reported(run):
+        pass
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    text = (Path(run.config.train.out) / "report.json").read_text()
+    found = json.loads(text, parse_constant=refuse)
+    assert found["train"]["loss"] is None
+    assert found["validation"]["mpvpe_mm_2views"] is None
+    assert found["best"].keys() == {"mpvpe_mm_2views", "mpvpe_mm_8views"}
+    assert found["best"]["mpvpe_mm_2views"]["value"] == 7.0
+
+
 class Page(HTMLParser):
     """Collects what a page draws and refers to; insists that tags are closed."""
 

@@ -66,12 +66,29 @@ def test_a_long_curve_is_averaged_to_few_points():
     assert np.all(np.diff(points[:, 1]) < 0.05)
 
 
-@pytest.mark.parametrize("y", [[5.0, 5.0], [0.0, 0.0], [1e-9, 1e-9], [-3.0, -3.0]])
+@pytest.mark.parametrize(
+    "y",
+    [[5.0, 5.0], [0.0, 0.0], [1e-9, 1e-9], [-3.0, -3.0], [1e308, 1e308], [5e-324, 5e-324], [1.0, 1 + 2e-16]],
+)
 def test_a_constant_has_an_axis(y):
     _, root = draw(Curve("a", np.array([1, 2]), np.array(y)))
     (points,) = polylines(root)
     assert np.isfinite(points).all()
     assert np.ptp(points[:, 1]) == 0
+
+
+@pytest.mark.parametrize("may_be_log", [True, False])
+@pytest.mark.parametrize(
+    "y", [[1e308, -1e308, np.nan], [1e308, 5e-324, 1.0], [1e308, 1e-290, 1.0], [5e-324, 1e-323, 1e-310]]
+)
+def test_the_largest_and_smallest_numbers_are_drawn(y, may_be_log):
+    """Also many of them, whose sum no number holds."""
+    many = np.tile(y, 1000)
+    curves = (Curve("a", np.arange(3), np.array(y)), Curve("b", np.arange(3000), many))
+    text, root = draw(*curves, may_be_log=may_be_log)
+    assert all(np.isfinite(points).all() for points in polylines(root))
+    assert not re.search("nan|inf", text)
+    assert len({word for _, word in ticks(root, "end")}) >= 2
 
 
 def test_what_is_not_finite_is_left_out():
