@@ -140,6 +140,8 @@ class _Run:
         options = self.config.train
         key = put_everywhere(jax.random.key(options.seed + 1), self.mesh)
         step, coming = self.sitting.step, None
+        if step == 0 and self._has_something_to_beat():
+            self._measure_the_start(state)
         while step < options.steps and not self._should_stop(step, stopped):
             if step == self.config.first_stage_steps > 0:
                 self._read_metrics()
@@ -147,14 +149,32 @@ class _Run:
             batch = self._place_next(step, batches) if coming is None else coming
             state = self._step(step, state, batch, key)
             step += 1
-            # The next batch goes to the devices while they work on this one; one, not more.
-            coming = self._place_next(step, batches) if step < options.steps else None
+            try:
+                # The next batch goes to the devices while they work on this one; one, not more.
+                wanted = step < options.steps and not stopped.is_set()
+                coming = self._place_next(step, batches) if wanted else None
+            except Exception:
+                # There is no next step, but this one is whole.
+                self._look_and_keep(step, state)
+                raise
             self._look_and_keep(step, state)
         self._checkpoint(state, wait=True)
         log.info("stopped after step %d of %d", step, options.steps)
         if step < options.steps:
             log.info("to go on: %s", self.sitting.how_to_go_on)
         return state
+
+    def _has_something_to_beat(self) -> bool:
+        """Say whether a run begins with a model, and watches frames or a score that it may make worse."""
+        options, mixture = self.config.train, self.config.data.mixture
+        holds_out = mixture is not None and any(part.held_out for part in mixture.parts)
+        return bool(options.init_from and options.validate_every and (options.keep_best or holds_out))
+
+    def _measure_the_start(self, state: TrainState) -> None:
+        """Validate what `init_from` brought: it may be the best there is."""
+        self._validate(0, state)
+        if self.config.train.keep_best:
+            self._checkpoint(state)
 
     def _place_next(self, step: int, batches: Generator[MultiViewBatch]) -> MultiViewBatch:
         with self.pace.waiting():

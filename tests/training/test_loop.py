@@ -18,8 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from poem_jax.data.augmentation_recipes import PAPER
 from poem_jax.io.stopping import Stopped
+from poem_jax.mixture.config import CapturesSource, MixtureConfig, Part
+from poem_jax.mixture.workers import WorkerDied
 from poem_jax.training import initial_state, loop
+from poem_jax.training.checkpoint_errors import CheckpointNotWritten
 from poem_jax.training.checkpoints import Checkpoints, export_run
 from poem_jax.training.config import DataParallel
 from poem_jax.training.journal import Journal
@@ -206,6 +210,58 @@ def test_costs_are_in_the_journal(micro_config, batch_at, light):
     assert last["peak_memory_mb"] > 50
 
 
+def ends(config, batch_at, kind):
+    """Train until the error; return its report, and the newest checkpoint."""
+    with pytest.raises(kind) as caught:
+        train(config, batch_at=batch_at)
+    found = report(config)
+    assert found["end"] == f"failed: {kind.__name__}: {caught.value}"
+    with Checkpoints(config.train.out, config) as checkpoints:
+        assert found["checkpoints"]["newest"] == checkpoints.latest_step
+        return found, checkpoints.latest_step
+
+
+@pytest.mark.parametrize("error", [OSError("disk gone"), WorkerDied("worker 3 was killed")])
+def test_an_error_of_the_source_costs_no_finished_step(micro_config, batch_at, light, error):
+    """Step 2 is finished, and has its line and its checkpoint, when the batch after it cannot be drawn."""
+
+    def broken(step):
+        if step == 2:
+            raise error
+        return batch_at(step)
+
+    found, newest = ends(micro_config, broken, type(error))
+    assert (found["step"], newest) == (2, 2)
+    assert [line["step"] for line in lines(micro_config)] == [2]
+    assert found["to_go_on"] == "the same command again"
+
+
+def test_a_full_disk_ends_a_run_with_a_report(micro_config, batch_at, light, monkeypatch):
+    checksums = Checkpoints._write_checksums
+
+    def full(self, step):
+        if step == 4:
+            raise OSError(28, "No space left on device")
+        checksums(self, step)
+
+    monkeypatch.setattr(Checkpoints, "_write_checksums", full)
+    found, _ = ends(with_run(micro_config, steps=6), batch_at, CheckpointNotWritten)
+    assert "checkpoint 4 in" in found["end"]
+    assert "No space left" in found["end"]
+    monkeypatch.undo()
+    assert (Path(micro_config.train.out) / "seals" / "2.json").is_file()
+
+
+def test_no_batch_is_placed_for_a_step_that_will_not_be(micro_config, batch_at, light, monkeypatch):
+    placed = []
+    put = loop.put_batch
+    monkeypatch.setattr(loop, "put_batch", lambda *given: placed.append(1) or put(*given))
+    monkeypatch.setattr(loop._Run, "_announce", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(Stopped):
+        train(micro_config, batch_at=batch_at)
+    assert (len(placed), report(micro_config)["step"]) == (1, 1)
+
+
 class LightValidation:
     """Errors that grow from the second validation on."""
 
@@ -241,6 +297,48 @@ def test_the_best_checkpoint_has_the_score_of_its_own_weights(micro_config, batc
     best = with_run(config, keep_best=True, out=config.train.out + "_best")
     train(best, batch_at=batch_at)
     assert saved == [(3, 10.0), (4, None), (6, 13.0), (6, 13.0)]
+
+
+@pytest.mark.parametrize("keep_best", [True, False])
+def test_a_run_that_starts_from_a_model_measures_it_first(
+    micro_config, batch_at, light, monkeypatch, tmp_path, keep_best
+):
+    """Once, also where it was killed; where the best is kept and training only harms, it is the best."""
+    errors = {0: 5.0, 2: 7.0, 4: 9.0}
+
+    class Harmed(LightValidation):
+        def __call__(self, state):
+            return {"mpvpe_mm_2views": errors[int(state.step)]}
+
+    monkeypatch.setattr(loop, "Validation", Harmed)
+    monkeypatch.setattr(
+        initial_state, "load", lambda folder, expected: (expected, initial_state.init(expected, key=None))
+    )
+    ratio = micro_config.model.crop.ratio
+    mixture = MixtureConfig(
+        (Part(CapturesSource((str(tmp_path),)), held_out=0.5),),
+        recipe=replace(PAPER, box_ratio=ratio),
+    )
+    data = replace(micro_config.data, mixture=None if keep_best else mixture)
+    options = {"init_from": "m", "validate_every": 2, "validation_views": (2,), "keep_checkpoints": 1}
+    config = with_run(replace(micro_config, data=data), keep_best=keep_best, **options)
+
+    def dies(step):
+        if step == 1:
+            raise OSError("killed")
+        return batch_at(step)
+
+    with pytest.raises(OSError, match="killed"):
+        train(config, batch_at=dies)
+    assert [line["step"] for line in lines(config, "validation")] == [0]
+    train(config, batch_at=batch_at)
+    assert [line["step"] for line in lines(config, "validation")] == [0, 2, 4]
+    assert report(config)["best"]["mpvpe_mm_2views"] == {"value": 5.0, "step": 0}
+    with Checkpoints(config.train.out, config) as checkpoints:
+        assert (checkpoints.steps, checkpoints.best_step) == (([4, 0], 0) if keep_best else ([4], 4))
+    fresh = with_run(config, init_from=None, out=config.train.out + "_fresh")
+    train(fresh, batch_at=batch_at)
+    assert [line["step"] for line in lines(fresh, "validation")] == [2, 4]
 
 
 def test_pictures_of_held_out_samples(micro_config, batch_at, light, monkeypatch):
