@@ -72,7 +72,7 @@ class BadSteps:
 
     def _leave_out(self, step: int, bad: Mapping[str, float]) -> None:
         self.left_out.append(step)
-        what = f"{bad or 'a gradient that is not finite'} at step {step}"
+        what = f"{bad or 'a gradient or statistic that is not finite'} at step {step}"
         if len(self.left_out) > self.allowed:
             raise FloatingPointError(
                 f"training stopped: {what}{self._kept(step)}. It is bad step {len(self.left_out)} of this "

@@ -25,7 +25,7 @@ from poem_jax.models.recompute import DecoderRow, TrunkRow
 from poem_jax.training.accumulation import Part, add_up, in_parts
 from poem_jax.training.config import Precision, Rematerialise, RootSource, TrainConfig, TrainingRoot
 from poem_jax.training.state import TrainState, learning_rate, make_optimizer, update_average
-from poem_jax.typing import Array, Bool, Float, Params, PRNGKeyArray
+from poem_jax.typing import Array, Bool, Float, Params, PRNGKeyArray, PyTree
 
 Metrics = dict[str, Array]
 
@@ -60,8 +60,8 @@ def train_step(
 
     Returns:
         The next state, and scalar metrics of this step, equal on all devices. Where `train.skip_bad_steps`
-        allows any, `bad_step` among them is 1 if the loss or the gradient is not finite; the state is then
-        the one before, but for its step.
+        allows any, `bad_step` among them is 1 if the loss, the gradient or a statistic is not finite; the
+        state is then the one before, but for its step and that of the learning rate.
 
     Raises:
         ValueError: the samples cannot be taken in `compute.accumulate` equal parts.
@@ -98,7 +98,7 @@ def train_step(
     metrics["learning_rate"] = jnp.asarray(learning_rate(config)(state.step))
     after = _updated(state, gradients, statistics, config)
     if config.train.skip_bad_steps:
-        is_finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["gradient_norm"])
+        is_finite = all_finite((metrics["loss"], metrics["gradient_norm"], statistics))
         metrics["bad_step"] = 1.0 - is_finite
         after = left_out_unless(is_finite, after, state)
     return after, metrics
@@ -229,7 +229,20 @@ def _updated(state: TrainState, gradients: Params, statistics: Params, config: T
     return TrainState(state.step + 1, params, opt_state, ema)
 
 
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
+    """Say whether every number of a tree is finite."""
+    return jnp.all(jnp.array([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]))
+
+
 def left_out_unless(is_finite: Bool[Array, ""], after: TrainState, before: TrainState) -> TrainState:
-    """Return the state after a step, or the one before with the step counted."""
-    kept = jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), after, before)
+    """Return the state after a step, or the one before with the step counted, also for the learning rate:
+    its schedule would else fall behind the run."""
+
+    def chosen(new: PyTree, old: PyTree) -> PyTree:
+        if isinstance(new, optax.ScaleByScheduleState):
+            return new
+        return jax.tree.map(lambda a, b: jnp.where(is_finite, a, b), new, old)
+
+    is_schedule = lambda entry: isinstance(entry, optax.ScaleByScheduleState)  # noqa: E731
+    kept = jax.tree.map(chosen, after, before, is_leaf=is_schedule)
     return kept._replace(step=after.step)

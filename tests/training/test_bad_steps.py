@@ -70,7 +70,7 @@ def test_steps_are_left_out_until_there_are_too_many(watch, tmp_path, caplog):
     assert bad_steps.check([(4, left_out(BAD)), (5, left_out(GOOD, 0.0))]) == [GOOD]
     assert bad_steps.check([(6, left_out(GOOD))]) == []
     assert "left out: {'pose': inf} at step 4" in caplog.text
-    assert "left out: a gradient that is not finite at step 6" in caplog.text
+    assert "left out: a gradient or statistic that is not finite at step 6" in caplog.text
     with pytest.raises(FloatingPointError, match=r"at step 8;.* bad step 3 of this sitting.*allows 2"):
         bad_steps.check([(7, left_out(GOOD, 0.0)), (8, left_out(BAD))])
     assert bad_steps.left_out == [4, 6, 8]

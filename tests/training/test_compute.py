@@ -26,8 +26,8 @@ from poem_jax.training.config import (
     Schedule,
     TrainConfig,
 )
-from poem_jax.training.state import TrainState, create_state
-from poem_jax.training.step import left_out_unless, train_step
+from poem_jax.training.state import TrainState, create_state, learning_rate, make_optimizer
+from poem_jax.training.step import all_finite, left_out_unless, train_step
 from tests.precision import products
 from tests.small_presets import NUM_VIEWS, small
 from tests.training.conftest import HW, MICRO
@@ -148,7 +148,9 @@ def test_a_step_in_parts_is_the_step(drawn_params, config, uneven):
     after, metrics = parts(state, uneven._replace(vertices_world=labels), KEY)
     assert metrics["bad_step"] == 1
     assert after.step == state.step + 1
-    jax.tree.map(np.testing.assert_array_equal, after._replace(step=0), state._replace(step=0))
+    counted = optax.ScaleByScheduleState(np.int32(1))
+    as_before = state._replace(step=after.step, opt_state=(*state.opt_state[:-1], counted))
+    jax.tree.map(np.testing.assert_array_equal, after, as_before)
 
 
 def test_a_step_that_is_not_finite_is_left_out():
@@ -158,6 +160,34 @@ def test_a_step_that_is_not_finite_is_left_out():
     kept = left_out_unless(jnp.array(False), after, before)
     jax.tree.map(np.testing.assert_array_equal, kept, before._replace(step=jnp.array(5)))
     jax.tree.map(np.testing.assert_array_equal, left_out_unless(jnp.array(True), after, before), after)
+
+
+def test_the_rate_of_a_warm_up_is_that_of_the_step_whatever_was_left_out(config):
+    """Adam moves a weight of constant gradient by the learning rate, which the log says."""
+    options = OptimizerConfig(learning_rate=0.1, schedule=Schedule.COSINE, warmup_steps=5, eps=0.0)
+    config = replace(config, optimizer=options)
+    optimizer, gradient = make_optimizer(config), {"w": jnp.array([0.5])}
+    params = {"trainable": {"w": jnp.zeros(1)}, "statistics": {}}
+    state = TrainState(jnp.zeros((), jnp.int32), params, optimizer.init(params["trainable"]), None)
+
+    @jax.jit
+    def take(state, is_good):
+        updates, opt_state = optimizer.update(gradient, state.opt_state, state.params["trainable"])
+        after = state._replace(step=state.step + 1, opt_state=opt_state)
+        return left_out_unless(is_good, after, state), updates["w"], learning_rate(config)(state.step)
+
+    for step in range(6):
+        state, moved, rate = take(state, step not in (1, 2))
+        np.testing.assert_allclose(moved, -rate, rtol=1e-4)
+    assert optax.tree.get(state.opt_state, "mu")["w"] == pytest.approx(0.5 * (1 - 0.9**4), rel=1e-5)
+
+
+def test_one_number_that_is_not_finite_is_found():
+    tree = {"loss": jnp.array(1.0), "statistics": {"mean": jnp.zeros(3), "empty": {}}}
+    assert all_finite(tree)
+    assert all_finite({})
+    for bad in (jnp.nan, jnp.inf):
+        assert not all_finite(tree | {"statistics": {"mean": jnp.array([0.0, bad, 0.0])}})
 
 
 def test_a_batch_that_has_no_equal_parts_is_refused(config, micro_batch):
