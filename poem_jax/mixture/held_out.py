@@ -1,7 +1,9 @@
 """Frames that a run never trains on: the last ones of every take of a source.
 
 Neighbours in a take look alike, so what is held out is contiguous: the end of each capture, shard, or of the
-whole list where a source does not tell its takes apart. All hands of an instant go the same way.
+whole list where a source does not tell its takes apart. All hands of an instant go the same way where the
+source tells instants (captures). Released tars and raw sets have each sample as its own instant: of a
+handover's two people, or of two hands, one may be trained on and the other held out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +48,7 @@ def hold_out(source: FrameSource, share: float) -> tuple[Subset, Subset]:
 
     Args:
         source: the source.
-        share: of the instants of every take, rounded; the last ones.
+        share: of the instants of every take, rounded, and at least one where a take has two; the last ones.
 
     Returns:
         Frames to train on, and held-out frames.
@@ -57,7 +59,8 @@ def hold_out(source: FrameSource, share: float) -> tuple[Subset, Subset]:
     takes = source.takes if isinstance(source, TakesSource) else _one_take(len(source))
     instants, instant_of = np.unique(takes, axis=0, return_inverse=True)
     _, first, sizes = np.unique(instants[:, 0], return_index=True, return_counts=True)
-    trained = np.array([size - round(share * size) for size in sizes.tolist()])
+    # A short take rounds to none, but no take with a second instant goes unwatched.
+    trained = np.array([size - max(round(share * size), min(size - 1, 1)) for size in sizes.tolist()])
     place = np.arange(len(instants)) - np.repeat(first, sizes)
     held = (place >= np.repeat(trained, sizes))[instant_of.reshape(-1)]
     if held.all() or not held.any():

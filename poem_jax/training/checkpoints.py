@@ -22,7 +22,7 @@ from poem_jax.training.checkpoint_errors import CheckpointNotWritten, names_dama
 from poem_jax.training.config import TrainConfig, flatten_config, git_commit
 from poem_jax.training.hosts import check_shared_folder, is_first_host, wait_for_all
 from poem_jax.training.identity import CONFIG_FILE, check_same_config, write_identity
-from poem_jax.training.keeping import NewestAndBest, Scores
+from poem_jax.training.keeping import NewestAndBest, Scores, what_is_scored
 from poem_jax.training.state import TrainState, create_state, evaluation_params
 from poem_jax.weights.store import check_leaves, flatten, save, unflatten
 
@@ -54,7 +54,7 @@ class Checkpoints:
                 write_identity(self.run_dir, config, self._meta["git_commit"])
         elif not self._place.is_dir():
             raise FileNotFoundError(f"no checkpoints in {self.run_dir}: train first, or pass --train.out")
-        self._scores = Scores(self.run_dir / _SCORES)
+        self._scores = Scores(self.run_dir / _SCORES, None if read_only else what_is_scored(config))
         keep = NewestAndBest(config.train.keep_checkpoints, self._scores, best=config.train.keep_best)
         self._orbax = ocp.training.Checkpointer(
             str(self._place), preservation_policy=keep, cleanup_tmp_directories=not read_only

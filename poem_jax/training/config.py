@@ -201,7 +201,8 @@ class RunConfig:
     checkpoint_every: int = 500
     keep_checkpoints: int = 2
     keep_best: bool = False
-    """Also keep the checkpoint with the least vertex error in validation, the mean over the view counts."""
+    """Also keep the checkpoint with the least vertex error in validation (`Validation.score`): the mean over
+    the parts that hold frames out, or where none does, over the numbers of views."""
     skip_bad_steps: int = 0
     """Steps whose loss or gradient is not finite that a sitting may leave out; one more stops it."""
     panel_every: int = 0

@@ -1,8 +1,9 @@
 """The held-out frames of a run's mixture, as batches for its validation."""
 
+import itertools
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import numpy as np
 
@@ -28,11 +29,12 @@ def held_out_batches(
         multiple_of: what sizes of batches must be a multiple of: the number of devices.
 
     Returns:
-        Batches by the part's name, blanks as underscores; the last one is filled up with samples that its
-        `sample_mask` leaves out. Nothing where no part holds frames out.
+        Batches by the part's name, blanks as underscores, and numbered where two are alike then; the last one
+        is filled up with samples that its `sample_mask` leaves out. Nothing where no part holds frames out.
 
     Raises:
-        ValueError: a part's held-out frames have one view each, in which the model cannot place a hand.
+        ValueError: none of a part's held-out frames can be used: they have one view each, say, in which the
+            model cannot place a hand.
     """
     parts = () if config.data.mixture is None else config.data.mixture.parts
     if not any(part.held_out for part in parts):
@@ -40,13 +42,21 @@ def held_out_batches(
     mixture = open_training_data(config) if mixture is None else mixture
     assert mixture is not None
     largest = max(shape.batch_size for shape in config.data.batches)
-    batches = {}
+    batches: dict[str, list[MultiViewBatch]] = {}
     for name, frames in mixture.held_out.items():
         samples = list(_read(config, name, frames))
         size = min(largest, -(-len(samples) // multiple_of) * multiple_of)
         chunks = [samples[i : i + size] for i in range(0, len(samples), size)]
-        batches[re.sub(r"\W+", "_", name)] = [_filled(config, chunk, size) for chunk in chunks]
+        batches[_free_name(re.sub(r"\W+", "_", name), batches)] = [
+            _filled(config, chunk, size) for chunk in chunks
+        ]
     return batches
+
+
+def _free_name(name: str, taken: Container[str]) -> str:
+    """Return the name, or where another part has it the first of `name_2`, `name_3` ... that is free."""
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    return next(free for free in names if free not in taken)
 
 
 def _read(config: TrainConfig, name: str, frames: FrameSamples) -> Iterator[MultiViewBatch]:

@@ -24,6 +24,8 @@ from poem_jax.typing import Array, Params, UInt8
 
 PANEL_ROWS = 4
 """Samples of a picture."""
+UNSOLVED_MM = 200.0
+"""What a sample that is not solved counts in the comparison of checkpoints: about the length of a hand."""
 
 
 class Validation:
@@ -34,14 +36,19 @@ class Validation:
     """
 
     def __init__(self, config: TrainConfig, mesh: Mesh, mixture: Mixture | None = None) -> None:
-        """Prepare; samples are drawn when they are first needed.
+        """Read the held-out frames of the mixture; synthetic captures are drawn when they are first needed.
 
         Args:
             config: the experiment.
             mesh: devices over which batches are split, of all hosts.
             mixture: the run's data where they are open already; None = opened here, if frames are held out.
+
+        Raises:
+            ValueError: none of a part's held-out frames can be used. Said here, before the first step: at the
+                first validation it would cost the steps before it, and again at every restart.
         """
-        self._config, self._mesh, self._mixture = config, mesh, mixture
+        self._config, self._mesh = config, mesh
+        self._by_part = held_out_batches(config, mixture, multiple_of=mesh.size)
         specs = (P(), P(AXIS))
         self._errors = jax.jit(
             jax.shard_map(
@@ -55,21 +62,30 @@ class Validation:
         millimetres.
 
         For each: the mean and median vertex error, the root's error where the model has one, and where it
-        takes one the vertex error with the true root given. Where there are several hosts, all must call.
+        takes one the vertex error with the true root given, of the samples that are solved
+        (`Prediction.valid`); and `unsolved_share`, that of the others, whose errors mean nothing. Where none
+        is solved, there is the share alone. Where there are several hosts, all must call.
         """
         metrics: dict[str, float] = {}
         params = evaluation_params(state)
         for group, batches in (self._by_views | self._by_part).items():
             found = [self._errors_of(params, batch) for batch in batches]
             errors = {name: np.concatenate([one[name] for one in found]) for name in found[0]}
-            metrics |= {f"{name}_{group}": float(values.mean()) for name, values in errors.items()}
-            metrics[f"median_mpvpe_mm_{group}"] = float(np.median(errors["mpvpe_mm"]))
+            solved = errors.pop("solved")
+            metrics[f"unsolved_share_{group}"] = float(1 - solved.mean())
+            if not solved.any():
+                continue
+            metrics |= {f"{name}_{group}": float(values[solved].mean()) for name, values in errors.items()}
+            metrics[f"median_mpvpe_mm_{group}"] = float(np.median(errors["mpvpe_mm"][solved]))
         return metrics
 
     def score(self, metrics: Mapping[str, float]) -> float:
         """Return the one number by which checkpoints are compared: the mean vertex error of the parts that
-        hold frames out, or where none does, of the numbers of views; millimetres."""
-        return float(np.mean([metrics[f"mpvpe_mm_{group}"] for group in self._by_part or self._by_views]))
+        hold frames out, or where none does, of the numbers of views; millimetres.
+
+        A sample that is not solved counts as `UNSOLVED_MM`, so that nothing is gained by solving fewer.
+        """
+        return float(np.mean([_with_unsolved(metrics, group) for group in self._by_part or self._by_views]))
 
     def panel(self, state: TrainState) -> UInt8[np.ndarray, "h w 3"]:
         """Draw what the averaged weights find in a few held-out samples, a row each, over all their views.
@@ -86,10 +102,6 @@ class Validation:
     def _by_views(self) -> dict[str, list[MultiViewBatch]]:
         counts = self._config.train.validation_views
         return {f"{n}views": validation_batches(self._config, n) for n in counts}
-
-    @cached_property
-    def _by_part(self) -> dict[str, list[MultiViewBatch]]:
-        return held_out_batches(self._config, self._mixture, multiple_of=self._mesh.size)
 
     @cached_property
     def _panel_batch(self) -> MultiViewBatch:
@@ -112,16 +124,25 @@ class Validation:
 
 def _errors(params: Params, batch: MultiViewBatch, *, config: TrainConfig) -> dict[str, Array]:
     """Reconstruct a device's part with the triangulated root and, where the model takes one, with the true
-    one; return the errors of all samples, on all devices."""
+    one; return the errors of all samples, and which are `solved`, on all devices."""
     views, cameras = batch.views, Cameras(*batch.cameras)
     found = apply(params, views, cameras, config=config.model)
-    errors = {"mpvpe_mm": _distance_mm(found.vertices_world, batch.vertices_world).mean(-1)}
+    errors = {
+        "solved": found.valid,
+        "mpvpe_mm": _distance_mm(found.vertices_world, batch.vertices_world).mean(-1),
+    }
     if found.root_world is not None:
         errors["root_mm"] = _distance_mm(found.root_world, batch.joints_world[:, ROOT_JOINT])
     if config.model.takes_root:
         given = apply(params, views, cameras, config=config.model, root_world=batch.root_world)
         errors["true_root_mpvpe_mm"] = _distance_mm(given.vertices_world, batch.vertices_world).mean(-1)
     return jax.lax.all_gather(errors, AXIS, tiled=True)
+
+
+def _with_unsolved(metrics: Mapping[str, float], group: str) -> float:
+    """Return a group's mean vertex error over all its samples, those that are not solved too."""
+    unsolved = metrics[f"unsolved_share_{group}"]
+    return (1 - unsolved) * metrics.get(f"mpvpe_mm_{group}", 0.0) + unsolved * UNSOLVED_MM
 
 
 def _distance_mm(a: Array, b: Array) -> Array:

@@ -62,12 +62,18 @@ def test_a_source_that_tells_no_takes_is_one():
     assert (trained.name, trained.max_views, trained.fingerprint()) == ("fake train", 3, {"fake.tar": "1"})
 
 
-@pytest.mark.parametrize(("share", "what"), [(0.01, "to validate on"), (0.99, "to train on")])
-def test_a_share_that_leaves_nothing_is_refused(share, what):
+@pytest.mark.parametrize(("share", "length", "what"), [(0.2, 1, "to validate on"), (0.99, 10, "to train on")])
+def test_a_share_that_leaves_nothing_is_refused(share, length, what):
     with pytest.raises(
         ValueError, match=rf"`held_out` {share} of fake train leaves nothing {what}: its 1 tak"
     ):
-        hold_out(FakeFrames(length=10), share)
+        hold_out(FakeFrames(length=length), share)
+
+
+@pytest.mark.parametrize("length", [2, 3, 10])
+def test_a_take_too_short_for_the_share_holds_one_instant_out(length):
+    trained, held_out = hold_out(FakeFrames(length=length), 0.01)
+    assert (indices(trained), indices(held_out)) == (set(range(length - 1)), {length - 1})
 
 
 def test_shares_that_mean_nothing_are_refused():

@@ -175,6 +175,25 @@ def test_the_best_is_kept_beside_the_newest(micro_config, state):
         assert (checkpoints.steps, checkpoints.best_step) == ([7, 6], 7)
 
 
+def test_scores_of_other_samples_do_not_compare_and_cost_no_checkpoint(micro_config, state, caplog):
+    config = replace(micro_config, train=replace(micro_config.train, keep_best=True, keep_checkpoints=1))
+    other = replace(config, train=replace(config.train, validation_seed=7))
+    with Checkpoints(config.train.out, config) as checkpoints:
+        for step, score in ((1, 3.0), (2, 4.0)):
+            checkpoints.save(at_step(state, step), score=score)
+    assert "do not count" not in caplog.text
+    with Checkpoints(config.train.out, other) as checkpoints:
+        assert checkpoints.best_step is None
+        assert "seed 7; scores of other samples do not count" in caplog.text
+        for step, score in ((3, 9.0), (4, 9.5), (5, None)):
+            checkpoints.save(at_step(state, step), score=score)
+        assert (checkpoints.steps, checkpoints.best_step) == ([5, 3, 1], 3)
+    with Checkpoints(config.train.out, config, read_only=True) as checkpoints:
+        assert checkpoints.best_step == 3
+    with Checkpoints(config.train.out, config) as checkpoints:
+        assert checkpoints.best_step == 1
+
+
 def test_without_keep_best_only_the_newest_are_kept(micro_config, state):
     with Checkpoints(micro_config.train.out, micro_config) as checkpoints:
         for step, score in enumerate((1.0, 2.0, 3.0)):

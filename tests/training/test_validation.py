@@ -14,7 +14,8 @@ from poem_jax.training import validation as module
 from poem_jax.training.config import BatchShape
 from poem_jax.training.held_out import held_out_batches
 from poem_jax.training.parallel import data_mesh
-from poem_jax.training.validation import Validation
+from poem_jax.training.source import open_training_data
+from poem_jax.training.validation import UNSOLVED_MM, Validation
 from tests.mixture.fake_frames import FakeFrames
 
 TRUTH_M = 0.25
@@ -22,7 +23,7 @@ TRUTH_M = 0.25
 
 
 def answer(params, views, cameras, *, config, root_world=None):
-    """Stand for `apply`: says the same of every sample, and nothing of one that starts with a masked view."""
+    """Stand for `apply`: says the same of every sample; one that starts with a masked view is not solved."""
     del params, config
     batch = views.shape[0]
     place = TRUTH_M if root_world is None else 0.0
@@ -53,7 +54,7 @@ def one_device():
 def test_errors_are_told_by_views_and_by_part_and_compared_by_part(config, micro_state):
     validation = Validation(config, one_device())
     errors = validation(micro_state)
-    names = ("mpvpe_mm", "median_mpvpe_mm", "root_mm", "true_root_mpvpe_mm")
+    names = ("mpvpe_mm", "median_mpvpe_mm", "root_mm", "true_root_mpvpe_mm", "unsolved_share")
     assert errors.keys() == {f"{name}_{group}" for name in names for group in ("2views", "3views", "my_rig")}
     assert validation.score(errors) == errors["mpvpe_mm_my_rig"]
     frames = FakeFrames("my rig", length=10)
@@ -67,7 +68,38 @@ def test_errors_are_told_by_views_and_by_part_and_compared_by_part(config, micro
 def test_without_held_out_frames_checkpoints_are_compared_by_views(config, micro_state):
     alone = replace(config, data=replace(config.data, mixture=None))
     validation = Validation(alone, one_device())
-    assert validation.score({"mpvpe_mm_2views": 4.0, "mpvpe_mm_3views": 2.0}) == 3.0
+    errors = {"mpvpe_mm_2views": 4.0, "mpvpe_mm_3views": 2.0}
+    solved = {"unsolved_share_2views": 0.0, "unsolved_share_3views": 0.0}
+    assert validation.score(errors | solved) == 3.0
+
+
+def test_samples_that_are_not_solved_are_no_part_of_the_means_but_of_the_score(config, micro_state):
+    validation = Validation(config, one_device())
+    whole = validation(micro_state)
+    batches = validation._by_part["my_rig"]
+    lost = batches[-1].cameras.view_mask
+    lost[:, 0] = False
+    errors = validation(micro_state)
+    assert (whole["unsolved_share_my_rig"], errors["unsolved_share_my_rig"]) == pytest.approx((0, 0.2))
+    assert errors["mpvpe_mm_2views"] == whole["mpvpe_mm_2views"]
+    assert validation.score(errors) == pytest.approx(0.8 * errors["mpvpe_mm_my_rig"] + 0.2 * UNSOLVED_MM)
+    for batch in batches:
+        batch.cameras.view_mask[:, 0] = False
+    errors = validation(micro_state)
+    assert {name: value for name, value in errors.items() if name.endswith("my_rig")} == {
+        "unsolved_share_my_rig": 1.0
+    }
+    assert validation.score(errors) == UNSOLVED_MM
+
+
+def test_two_parts_whose_names_read_alike_are_both_watched(config):
+    part = config.data.mixture.parts[0]
+    mixture = open_training_data(
+        replace(config, data=replace(config.data, mixture=MixtureConfig((part, part, part), processes=0)))
+    )
+    for samples, name in zip(mixture.parts, ("my rig", "my-rig", "my_rig"), strict=True):
+        samples.source.name = name
+    assert list(held_out_batches(config, mixture)) == ["my_rig", "my_rig_2", "my_rig_3"]
 
 
 def test_samples_that_fill_a_batch_are_marked(config):
@@ -79,12 +111,12 @@ def test_samples_that_fill_a_batch_are_marked(config):
     assert [batch.sample_mask.tolist() for batch in batches] == [[True, True, True, False]]
 
 
-def test_frames_of_one_view_cannot_be_watched_by_a_model_that_triangulates(config, monkeypatch):
+def test_frames_of_one_view_are_refused_by_a_model_that_triangulates_before_it_steps(config, monkeypatch):
     monkeypatch.setattr(CapturesSource, "open", lambda source: FakeFrames("lone", length=10, views=1))
     with pytest.raises(
         ValueError, match=r"none of 5 held-out frames of lone can be used; a Config needs 2 views"
     ):
-        held_out_batches(config)
+        Validation(config, one_device())
 
 
 def test_the_panel_shows_all_views_of_held_out_samples(config, micro_state):
