@@ -7,9 +7,10 @@ import atexit
 import hashlib
 import logging
 import os
+import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -79,6 +80,11 @@ def start_hosts(coordinator: str | None, count: int | None, index: int | None) -
             "processes with one of these, or name them: --coordinator HOST:PORT --num-hosts N --host-index I"
         ) from error
     except jax.errors.JaxRuntimeError as error:
+        if coordinator is None:
+            raise ConnectionError(
+                f"this host has not found the others that its launcher names: {_first_line(error)}. All of "
+                "them must start within 5 minutes, with open ports among them"
+            ) from error
         raise ConnectionError(
             f"host {index} of {count} has not found the others at {coordinator}: {_first_line(error)}. Start "
             "all of them within 5 minutes, each with its own --host-index; the port must be free on the "
@@ -123,6 +129,20 @@ def wait_for_all(name: str) -> None:
         return
     with names_lost_host():
         multihost_utils.sync_global_devices(name)
+
+
+def as_on_first_host(numbers: Sequence[int]) -> list[int]:
+    """Return the first host's numbers on all of them: what a disk holds may show on each at another time.
+
+    Raises:
+        HostLost: another host has ended.
+    """
+    if jax.process_count() == 1:
+        return list(numbers)
+    with names_lost_host():
+        count = int(multihost_utils.broadcast_one_to_all(np.int32(len(numbers))))
+        own = numbers if is_first_host() else [0] * count
+        return [int(number) for number in multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32))]
 
 
 def check_same_everywhere(what: str, text: str) -> None:
@@ -184,7 +204,7 @@ def names_lost_host() -> Iterator[None]:
         yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         # A ValueError where it shows when an array is fetched.
-        if jax.process_count() == 1 or not any(word in str(error) for word in _LOST):
+        if jax.process_count() == 1 or not _LOST.search(str(error)):
             raise
         message = (
             f"host {jax.process_index()} of {jax.process_count()} cannot go on: another host has ended or "
@@ -197,16 +217,12 @@ def names_lost_host() -> Iterator[None]:
         raise HostLost(message) from error
 
 
-_LOST = (
-    "Gloo",
-    "Connection reset",
-    "Connection closed",
-    "heartbeat",
-    "UNAVAILABLE",
-    "DEADLINE_EXCEEDED",
-    "NCCL",
+_LOST = re.compile(
+    r"Gloo|heartbeat|Barrier timed out|[Cc]oordination ?[Ss]ervice|Connection (reset|closed) by peer"
+    r"|remote process exited|ncclRemoteError|failed to connect to all addresses"
 )
-"""Words in the errors of collectives whose other side is gone."""
+"""Words in the errors of collectives whose other side is gone, and of nothing that fails on one host alone:
+NCCL also says that its own memory is full, and storage that it is unavailable."""
 
 
 def _first_line(error: Exception) -> str:

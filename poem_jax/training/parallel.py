@@ -46,7 +46,8 @@ def split_batch(mesh: Mesh) -> NamedSharding:
 
 
 def check_batch_sizes(config: TrainConfig, mesh: Mesh) -> None:
-    """Insist that every batch can be split evenly over the devices of all hosts.
+    """Insist that every batch can be split evenly over the devices of all hosts, and on each of them into
+    the parts that it takes one after the other.
 
     Raises:
         ValueError: it cannot, or hosts have different numbers of devices, or the model's samples depend on
@@ -66,10 +67,12 @@ def check_batch_sizes(config: TrainConfig, mesh: Mesh) -> None:
             "Show JAX fewer on some (CUDA_VISIBLE_DEVICES, `train.host_devices`), or leave a host out"
         )
     sizes = [shape.batch_size for shape in config.data.batches]
-    if any(size % mesh.size for size in sizes):
+    parts = config.compute.accumulate
+    if any(size % (mesh.size * parts) for size in sizes):
         hosts = f" of all {len(of_hosts)} hosts" if len(of_hosts) > 1 else ""
+        times = f", times `compute.accumulate` = {parts}, {mesh.size * parts}" if parts > 1 else ""
         raise ValueError(
-            f"every `batch_size` must be a multiple of the number of devices{hosts}, {mesh.size}; "
+            f"every `batch_size` must be a multiple of the number of devices{hosts}, {mesh.size}{times}; "
             f"got {sizes}. "
             "Change `data.batches`, or show JAX fewer devices (CUDA_VISIBLE_DEVICES, `train.host_devices`)"
         )

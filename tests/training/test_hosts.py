@@ -22,9 +22,11 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from poem_jax.training import hosts
+from poem_jax.training.config import ComputeConfig
 from poem_jax.training.hosts import (
     HostLost,
     any_host,
+    as_on_first_host,
     check_same_everywhere,
     is_first_host,
     names_lost_host,
@@ -70,6 +72,17 @@ def test_without_a_launcher_it_is_said_how_to_name_the_hosts(monkeypatch):
         start_hosts(None, None, None)
 
 
+def test_where_a_launcher_names_the_hosts_none_is_called_none(monkeypatch):
+    def initialize(*_, **__):
+        raise jax.errors.JaxRuntimeError("DEADLINE_EXCEEDED: no answer")
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    with pytest.raises(ConnectionError, match="this host has not found the others that its launcher names"):
+        start_hosts(None, None, None)
+    with pytest.raises(ConnectionError, match=r"host 1 of 2 has not found the others at 10\.0\.0\.1:1234"):
+        start_hosts("10.0.0.1:1234", 2, 1)
+
+
 @pytest.mark.parametrize("kind", [jax.errors.JaxRuntimeError, ValueError])
 def test_a_lost_host_is_named_and_other_errors_stay(monkeypatch, kind):
     lost = kind("UNKNOWN: Gloo AllGather failed: Connection closed by peer\nmore")
@@ -82,8 +95,14 @@ def test_a_lost_host_is_named_and_other_errors_stay(monkeypatch, kind):
         names_lost_host(),
     ):
         raise lost
-    with pytest.raises(kind), names_lost_host():
-        raise kind("RESOURCE_EXHAUSTED: out of memory")
+    for local in (
+        "RESOURCE_EXHAUSTED: out of memory",
+        "INTERNAL: NCCL operation ncclCommInitRank failed: unhandled cuda error",
+        "UNAVAILABLE: Error reading storage",
+        "DEADLINE_EXCEEDED: reading the kernel took too long",
+    ):
+        with pytest.raises(kind), names_lost_host():
+            raise kind(local)
 
 
 def test_what_hosts_must_have_alike_is_compared(monkeypatch):
@@ -97,6 +116,21 @@ def test_what_hosts_must_have_alike_is_compared(monkeypatch):
     check_same_everywhere("config", "a")
     with pytest.raises(ValueError, match=r"the same config; hosts \[1\] have another than the first one"):
         check_same_everywhere("config", "a")
+
+
+def test_what_the_first_host_sees_holds_for_all(monkeypatch):
+    told = []
+
+    def broadcast(own):
+        told.append(own)
+        return np.int32(2) if own.ndim == 0 else np.array([4, 2], np.int32)
+
+    assert as_on_first_host([7]) == [7]
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    monkeypatch.setattr(multihost_utils, "broadcast_one_to_all", broadcast)
+    assert as_on_first_host([2]) == [4, 2]
+    assert [np.shape(own) for own in told] == [(), (2,)]
 
 
 def test_a_folder_that_is_not_shared_is_refused(monkeypatch, tmp_path):
@@ -132,6 +166,10 @@ def test_batches_must_split_over_the_devices_of_all_hosts(tmp_path):
         check_batch_sizes(config, mesh_of(0, 0, 1))
     with pytest.raises(ValueError, match=r"multiple of the number of devices of all 3 hosts, 3; got \[4\]"):
         check_batch_sizes(config, mesh_of(0, 1, 2))
+    halves = replace(config, compute=ComputeConfig(accumulate=2))
+    check_batch_sizes(halves, mesh_of(0, 1))
+    with pytest.raises(ValueError, match=r"hosts, 4, times `compute.accumulate` = 2, 8; got \[4\]"):
+        check_batch_sizes(halves, mesh_of(0, 1, 2, 3))
 
 
 class Hosts:
