@@ -4,7 +4,7 @@ A step's samples have numbers that no host and no device enters into. Of several
 them, so that all together have the batch of a single one, in its order.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,6 +21,8 @@ from poem_jax.training.config import BatchShape, DataConfig, TrainConfig
 from poem_jax.training.hosts import is_first_host, wait_for_all
 
 BatchAt = Callable[[int], MultiViewBatch]
+DrawSamples = Callable[[Sequence[tuple[int, int]]], Sequence[MultiViewBatch]]
+"""From indices of samples, each with its number of views, to the samples."""
 
 _BATCH_STREAM = 1000
 """Third part of the seed of a batch's layout; the dataset's own streams of a sample are small numbers."""
@@ -113,14 +115,22 @@ def mixture_batches(config: DataConfig, stream: MixtureStream, *, host: int = 0,
     return batch_at
 
 
-def synthetic_batches(config: DataConfig, *, host: int = 0, hosts: int = 1) -> BatchAt:
+def synthetic_batches(
+    config: DataConfig, *, draw: DrawSamples | None = None, host: int = 0, hosts: int = 1
+) -> BatchAt:
     """Return the function from a step to this host's part of its batch.
 
     Nothing but the step and the seed decides a batch, so that a resumed run sees exactly the samples that it
     would have seen. No sample index comes twice.
+
+    Args:
+        config: the kinds of batches, and of which captures.
+        draw: gives the samples of a batch, each asked for by its index and its number of views; None = one
+            after the other, here.
+        host, hosts: this one, of how many.
     """
-    dataset = SyntheticDataset(config.synthetic, seed=config.seed)
     largest = max(shape.batch_size for shape in config.batches)
+    draw = draw or _drawn_here(config)
 
     def batch_at(step: int) -> MultiViewBatch:
         rng = np.random.default_rng((config.seed, step, _BATCH_STREAM))
@@ -129,10 +139,14 @@ def synthetic_batches(config: DataConfig, *, host: int = 0, hosts: int = 1) -> B
             shape.min_views or shape.num_views, shape.num_views, shape.batch_size, endpoint=True
         )
         rows = host_rows(step, shape.batch_size, largest, host=host, hosts=hosts)
-        samples = [dataset.sample(row, num_views=int(counts[row - step * largest])) for row in rows]
-        return collate(samples, shape.num_views)
+        return collate(draw([(row, int(counts[row - step * largest])) for row in rows]), shape.num_views)
 
     return batch_at
+
+
+def _drawn_here(config: DataConfig) -> DrawSamples:
+    dataset = SyntheticDataset(config.synthetic, seed=config.seed)
+    return lambda asked: [dataset.sample(index, num_views=views) for index, views in asked]
 
 
 def choose_shape(config: DataConfig, rng: np.random.Generator) -> BatchShape:
