@@ -7,6 +7,17 @@ from enum import Enum
 
 import jax
 
+CPU = {
+    "device": "cpu",
+    "jax": "0",
+    "backend": "cpu",
+    "float32_peak_tflops": 5.0,
+    "bfloat16_peak_tflops": None,
+    "float32_product_tflops": 4.0,
+    "bfloat16_product_tflops": 10.0,
+}
+"""The figures of a machine."""
+
 
 class Ending(Enum):
     FINE = "fine"
@@ -19,6 +30,7 @@ class Ending(Enum):
 class Planted:
     ending: Ending
     about_s: float = 0.0
+    smaller: None = None
 
     @property
     def name(self) -> str:

@@ -2,16 +2,16 @@
 
 import argparse
 import importlib.metadata
+import itertools
 import shutil
-import signal
 import sys
 from pathlib import Path
 
-from poem_jax.cli.signals import STOPPED, exit_code, stop_on_signals
+from poem_jax.cli.signals import exit_code, stop_on_signals
 from tools.accelerator import parts, readme
 from tools.accelerator.budget import Budget
-from tools.accelerator.going_on import SAVING_S, figures_of, train_on
-from tools.accelerator.measurer import Measurer, RowFailed
+from tools.accelerator.going_on import SAVING_S, ended_as_asked, figures_of, newest_step, train_on
+from tools.accelerator.measurer import DoesNotFit, Measurer, RowFailed
 from tools.accelerator.plan import PLANS, Plan
 from tools.accelerator.results import Figures, Results
 
@@ -21,6 +21,8 @@ _LEAST_TRAINING_S = 15.0
 """Beside the time for saving: less would not reach its first step."""
 _STARTING_S = 60.0
 """Of JAX and the driver, where they are slow."""
+PARTS = "parts"
+"""Folder below `--out` with the run, to carry away."""
 _README = Path(__file__).parents[2] / "README.md"
 
 
@@ -49,6 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(given: argparse.Namespace, plan: Plan, budget: Budget) -> int:
     results = Results(given.out)
+    _take_the_newer(given.run, given.out / PARTS)
     on_cpu = given.device == "cpu"
     with Measurer(on_cpu=on_cpu) as measurer:
         results.use_machine(_machine(measurer, plan, budget, on_cpu=on_cpu))
@@ -73,8 +76,11 @@ def _machine(measurer: Measurer, plan: Plan, budget: Budget, *, on_cpu: bool) ->
 
 
 def _measure(measurer: Measurer, plan: Plan, results: Results, budget: Budget, *, keep: float) -> None:
-    """Measure the rows that have no figures yet, as long as there is time."""
-    for row in plan.rows:
+    """Measure the rows that have no figures yet, as long as there is time; after one that does not fit into
+    memory at once what is smaller."""
+    coming = list(reversed(plan.rows))
+    while coming:
+        row = coming.pop()
         if results.is_measured(row.name):
             print(f"{row.name}: measured before", flush=True)
             continue
@@ -88,35 +94,55 @@ def _measure(measurer: Measurer, plan: Plan, results: Results, budget: Budget, *
                 results.note(row.name, measurer.measure(row, limit))
             except RowFailed as error:
                 results.note(row.name, {"problem": f"failed: {error}"})
+                if isinstance(error, DoesNotFit) and row.smaller is not None:
+                    coming.append(row.smaller)
         print(f"{row.name}: {_in_words(results.rows[row.name])}", flush=True)
 
 
 def _go_on(given: argparse.Namespace, results: Results, budget: Budget, *, on_cpu: bool) -> int:
-    """Train from where the run, or its parts, stand; pack what comes of it."""
-    packed = given.out / "parts"
-    if not given.run.exists() and packed.exists():
-        given.run.parent.mkdir(parents=True, exist_ok=True)
-        parts.unpack(packed, given.run)
-        print(f"the run of {packed} goes on in {given.run}", flush=True)
+    """Train from where the run stands; pack what comes of it."""
+    packed = given.out / PARTS
     if budget.left(keep=SAVING_S) < _LEAST_TRAINING_S:
         print("no time is left to train on")
         return 0
     try:
         code = train_on(given.run, given.size, budget, on_cpu=on_cpu)
     finally:
-        if _has_checkpoint(given.run):
-            files = parts.pack(given.run, packed)
+        step = newest_step(given.run)
+        if step is not None:
+            files = parts.pack(given.run, packed, step=step)
             results.going_on = figures_of(given.run)
             results.write()
             print(f"{len(files)} files in {packed}: the run, to go on with elsewhere", flush=True)
-    if code in (0, STOPPED + signal.SIGTERM):
+    if ended_as_asked(code):
         return 0
     print(f"error: the training ended with {code}; its words are above", file=sys.stderr)
     return 1
 
 
-def _has_checkpoint(run: Path) -> bool:
-    return any(folder.name.isdigit() for folder in (run / "checkpoints").glob("*"))
+def _take_the_newer(run: Path, packed: Path) -> None:
+    """Unpack the run that was carried here, unless the one that stands here is as far; nothing is removed.
+
+    Raises: ValueError: a part is missing or damaged.
+    """
+    if not packed.exists():
+        return
+    carried, here = parts.step_of(packed), newest_step(run)
+    if here is not None and here >= carried:
+        return
+    kept = None
+    if run.exists():
+        kept = next(p for n in itertools.count(1) if not (p := run.with_name(f"{run.name}.{n}")).exists())
+        run.rename(kept)
+    try:
+        run.parent.mkdir(parents=True, exist_ok=True)
+        parts.unpack(packed, run)
+    except ValueError:
+        if kept is not None:
+            kept.rename(run)
+        raise
+    older = "" if kept is None else f"; the one that stood there, older, is now {kept}"
+    print(f"the run of {packed}, at step {carried}, goes on in {run}{older}", flush=True)
 
 
 def _what_is_missing(machine: Figures) -> str:

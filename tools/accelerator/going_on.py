@@ -3,7 +3,6 @@
 It ends after so many minutes or at SIGTERM, with a checkpoint either way, as every run does.
 """
 
-import json
 import os
 import signal
 import subprocess
@@ -12,14 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from poem_jax.cli.messages import set_up_logging
-from poem_jax.cli.signals import exit_code, stop_on_signals
+from poem_jax.cli.signals import STOPPED, exit_code, stop_on_signals
 from poem_jax.training.config import TrainConfig
+from poem_jax.training.journal import METRICS, read_entries
 from tools.accelerator.budget import Budget
 from tools.accelerator.results import Figures
 
-_LAST_WORDS_S = 30.0
-"""For the step under way and its checkpoint when the time is up; then the process is killed, and the
-checkpoint before stands."""
+_LAST_WORDS_S = 60.0
+"""For the step under way, a program that may still be compiled for it, and its checkpoint when the time is
+up; then the process is killed, and the checkpoint before stands."""
+FIRST_CHECKPOINT = 20
+"""Steps between the checkpoints of a first sitting: one that must be killed, since a program is compiled too
+long, shall leave a run, and lose little of it."""
 _PATIENCE_S = 300.0
 """For the same after a signal, which sets no time."""
 SAVING_S = _LAST_WORDS_S + 10.0
@@ -56,15 +59,35 @@ def stop(process: "subprocess.Popen[bytes]", seconds: float) -> int:
         return process.wait()
 
 
+def ended_as_asked(code: int) -> bool:
+    """Say whether an exit code is that of a training at its end, or of one that was told to stop; before it
+    listens, the signal itself ends it."""
+    return code in (0, STOPPED + signal.SIGTERM, -signal.SIGTERM)
+
+
 def figures_of(run: Path) -> Figures:
     """Return what the journal of a run says last of its pace, its loss and its validation."""
-    file = run / "metrics.jsonl"
-    text = file.read_text(encoding="utf-8") if file.exists() else ""
     found: Figures = {}
-    # The last line may be half written.
-    for line in map(json.loads, text.split("\n")[:-1]):
-        found[line["group"]] = {key: value for key, value in line.items() if key != "group"}
+    for entry in read_entries(run / METRICS):
+        found[entry["group"]] = {key: value for key, value in entry.items() if key != "group"}
     return found
+
+
+def newest_step(run: Path) -> int | None:
+    """Return the step of a run's newest checkpoint; None = it has none."""
+    names = (folder.name for folder in (run / "checkpoints").glob("*"))
+    return max((int(name) for name in names if name.isdigit()), default=None)
+
+
+def sitting_of(config: TrainConfig, run: Path, minutes: float) -> TrainConfig:
+    """Return the experiment as it is trained in a folder for so long; a fresh run is soon on disk."""
+    every = config.train.checkpoint_every
+    if newest_step(run) is None:
+        every = min(every, FIRST_CHECKPOINT)
+    options = replace(
+        config.train, out=str(run), max_minutes=max(minutes, 0.01), checkpoint_every=every, progress=False
+    )
+    return replace(config, train=options)
 
 
 def _train(config: TrainConfig, processes: int) -> None:
@@ -83,12 +106,11 @@ def main(arguments: list[str]) -> int:
     run, size, minutes = arguments
     set_up_logging()
     use_compilation_cache()
-    config = PLANS[size]().going_on
-    options = replace(config.train, out=run, max_minutes=max(float(minutes), 0.01), progress=False)
+    config = sitting_of(PLANS[size]().going_on, Path(run), float(minutes))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         with stop_on_signals():
-            _train(replace(config, train=options), processes=max(cores - 1, 1))
+            _train(config, processes=max(cores - 1, 1))
     except KeyboardInterrupt as request:
         return exit_code(request)
     return 0

@@ -20,6 +20,10 @@ class RowFailed(RuntimeError):
     """A row has no figures; the message says why."""
 
 
+class DoesNotFit(RowFailed):
+    """The device's memory does not suffice for a row."""
+
+
 class Measurer:
     """The process that measures, started when the first row comes and again after one that ended it."""
 
@@ -41,7 +45,9 @@ class Measurer:
     def measure(self, row: Row, limit_s: float) -> Figures:
         """Return a row's figures.
 
-        Raises: RowFailed: memory did not suffice, the process died, or the limit came.
+        Raises:
+            DoesNotFit: memory did not suffice.
+            RowFailed: anything else went wrong, the process died, or the limit came.
         """
         process = self._started()
         assert process.stdin is not None
@@ -65,7 +71,8 @@ class Measurer:
         finally:
             limit.cancel()
         if isinstance(reply, Failure):
-            raise RowFailed(str(reply.error))
+            kind = DoesNotFit if isinstance(reply.error, MemoryError) else RowFailed
+            raise kind(str(reply.error))
         return reply
 
     def close(self) -> None:

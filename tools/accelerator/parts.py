@@ -1,7 +1,7 @@
 """A folder as files of at most 16 MiB that can be carried away one by one, and back into a folder.
 
-`pack` writes 000.part, 001.part, ... and parts.json with size and SHA-256 of each. Parts that stand there go
-only when the new ones are complete.
+`pack` writes 000.part, 001.part, ... and parts.json with size and SHA-256 of each, and how far the run in the
+folder is. Parts that stand there go only when the new ones are complete.
 """
 
 import hashlib
@@ -19,8 +19,14 @@ PART_BYTES = 16 * 2**20
 LISTING = "parts.json"
 
 
-def pack(folder: Path, into: Path, *, limit: int = PART_BYTES) -> list[Path]:
+def pack(folder: Path, into: Path, *, step: int, limit: int = PART_BYTES) -> list[Path]:
     """Write a folder as parts to the folder `into`, in the place of the parts that may stand there.
+
+    Args:
+        folder: what is packed, a run.
+        into: where the parts are to be.
+        step: of the newest checkpoint, for `step_of`.
+        limit: bytes of a part at most.
 
     Returns: the files written, the list of parts last.
     """
@@ -31,7 +37,7 @@ def pack(folder: Path, into: Path, *, limit: int = PART_BYTES) -> list[Path]:
     writer = _Parts(fresh, limit)
     with writer, tarfile.open(fileobj=writer, mode="w|") as tar:  # pyright: ignore[reportArgumentType, reportCallIssue]
         tar.add(folder, arcname=".")
-    listing = json.dumps({"parts": writer.written}, indent=1) + "\n"
+    listing = json.dumps({"step": step, "parts": writer.written}, indent=1) + "\n"
     (fresh / LISTING).write_text(listing, encoding="utf-8")
     if into.exists():
         into.rename(old)
@@ -57,13 +63,27 @@ def unpack(parts: Path, folder: Path) -> None:
     half.rename(folder)
 
 
-def _checked(parts: Path) -> list[Path]:
+def step_of(parts: Path) -> int:
+    """Return how far the run is that was packed.
+
+    Raises: ValueError: the list of parts is none.
+    """
+    return _listed(parts)[0]
+
+
+def _listed(parts: Path) -> tuple[int, list[tuple[str, int, str]]]:
+    """Read the step, and the name, size and SHA-256 of every part."""
     listing = parts / LISTING
     try:
-        entries = read_json(listing, what="list of parts")["parts"]
-        expected = [(str(e["file"]), int(e["bytes"]), str(e["sha256"])) for e in entries]
-    except (KeyError, TypeError) as error:
+        content = read_json(listing, what="list of parts")
+        entries = [(str(e["file"]), int(e["bytes"]), str(e["sha256"])) for e in content["parts"]]
+        return int(content["step"]), entries
+    except (KeyError, TypeError, FileNotFoundError) as error:
         raise ValueError(f"{listing} is not a list of parts: {type(error).__name__} {error}") from error
+
+
+def _checked(parts: Path) -> list[Path]:
+    _, expected = _listed(parts)
     files = [parts / Path(name).name for name, _, _ in expected]
     for file, (_, size, digest) in zip(files, expected, strict=True):
         if not file.is_file():

@@ -53,6 +53,7 @@ def whole_plan() -> Plan:
         Fitting(frames=500),
         *training("v2-base", v2_base_synthetic, HALF, 64),
         *training("tiny", tiny_synthetic, HALF, 256),
+        *training("v2-base", v2_base_synthetic, FULL, 32),
         *inference(HALF, 8, 8),
         *inference(FULL, 8, 8),
         *inference(HALF, 4, 32, 1),

@@ -1,9 +1,12 @@
-"""Seconds of a call, the one that compiles apart."""
+"""Seconds of a call, the one that compiles apart, and in what its products are computed."""
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
+
+from poem_jax.training.config import Precision
 
 LEAST_ROUNDS = 7
 LEAST_S = 1.5
@@ -23,6 +26,18 @@ class Taken(NamedTuple):
     def figures(self) -> dict[str, float | int]:
         """Return it as figures of a row."""
         return {"first_s": self.first_s, "ms": 1000 * self.median_s, "rounds": self.rounds}
+
+
+@contextmanager
+def products_in(precision: Precision) -> Iterator[None]:
+    """Have float32 mean float32: by default a GPU rounds the factors of its products to TF32, 10 bits."""
+    import jax
+
+    if precision is Precision.FLOAT32:
+        with jax.default_matmul_precision("highest"):
+            yield
+    else:
+        yield
 
 
 def time_calls(call: Callable[[], Any]) -> Taken:

@@ -5,6 +5,7 @@ answer; whatever else goes wrong ends the process, and says so on stderr.
 """
 
 import os
+import re
 import signal
 import sys
 from typing import IO
@@ -12,6 +13,8 @@ from typing import IO
 from poem_jax.mixture.wire import Failure, receive, send
 from tools.accelerator.results import Figures
 from tools.accelerator.rows import Row
+
+_OUT_OF_MEMORY = re.compile("RESOURCE_EXHAUSTED|out.of.memory", re.IGNORECASE)
 
 
 def serve(requests: IO[bytes], replies: IO[bytes]) -> None:
@@ -29,8 +32,10 @@ def _answer(row: Row) -> Figures | Failure:
     try:
         return row.measure()
     except jax.errors.JaxRuntimeError as error:
-        # Mostly memory: XLA's words are long, and their first line says what was asked for.
-        return Failure(RuntimeError(str(error).strip().splitlines()[0][:300]))
+        # XLA's words are long; of memory their first line says what was asked for.
+        words = str(error).strip()
+        kind = MemoryError if _OUT_OF_MEMORY.search(words) else RuntimeError
+        return Failure(kind(words.splitlines()[0][:300]))
     finally:
         jax.clear_caches()
 
