@@ -166,7 +166,13 @@ def _do_in_processes(**options: Any) -> Any:
     running = [
         _start("time_scaling_of_hosts", 1, {**options, **hosts, "index": index}) for index in range(PROCESSES)
     ]
-    first, *_ = (_result(process) for process in running)
+    try:
+        first, *_ = [_result(process) for process in running]
+    finally:
+        # One that failed leaves the others waiting for it.
+        for process in running:
+            with process:
+                process.kill()
     return first
 
 

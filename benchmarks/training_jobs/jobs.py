@@ -92,6 +92,7 @@ def measure_wait(name: str, steps: int, thin: bool) -> dict[str, float]:
     batches = draw_ahead(
         synthetic_batches(config.data), 0, ahead=config.data.prefetch, workers=drawing_threads(config.data)
     )
+    coming = {(kind.batch_size, kind.num_views) for kind in config.data.batches if kind.weight}
     seen: set[tuple[int, ...]] = set()
     waited = busy = 0.0
     samples = counted = 0
@@ -101,11 +102,11 @@ def measure_wait(name: str, steps: int, thin: bool) -> dict[str, float]:
         drawn = time.perf_counter()
         state, metrics = step(state, put_batch(batch, mesh), key)
         jax.block_until_ready(metrics)
-        if batch.views.shape in seen and len(seen) == len(config.data.batches):
+        if seen == coming:
             waited += drawn - start
             busy += time.perf_counter() - start
             samples, counted = samples + len(batch.views), counted + 1
-        seen.add(batch.views.shape)
+        seen.add(batch.views.shape[:2])
     batches.close()
     return {"share": waited / busy, "rate": samples / busy}
 
