@@ -269,4 +269,7 @@ class _Run:
             return False
         limit = self.config.train.max_minutes
         late = limit is not None and time.monotonic() - self.sitting.start > 60 * limit
-        return any_host(stopped.is_set() or late)
+        stops = any_host(stopped.is_set() or late)
+        if stops and not late:
+            self.sitting.stopped_early = "stopped by another host: a signal, or its `train.max_minutes`"
+        return stops

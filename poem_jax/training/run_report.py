@@ -39,6 +39,8 @@ class Sitting:
     checkpoints: Checkpoints | None = None
     left_out: list[int] = field(default_factory=list)
     """Steps, counted from 0, that were not finite and left out."""
+    stopped_early: str = "the time of `train.max_minutes` was over"
+    """What the report says where the run stops before its last step, neither by a signal nor by an error."""
     start: float = field(default_factory=time.monotonic)
 
     def begin(self, first_step: int, checkpoints: Checkpoints) -> None:
@@ -68,7 +70,7 @@ def reported(sitting: Sitting) -> Iterator[None]:
             log.warning("the report of the run cannot be written: %r", problem)
         raise
     finished = sitting.step >= sitting.config.train.steps
-    _write(sitting, "finished" if finished else "the time of `train.max_minutes` was over")
+    _write(sitting, "finished" if finished else sitting.stopped_early)
 
 
 def _write(sitting: Sitting, end: str) -> None:

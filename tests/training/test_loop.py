@@ -29,6 +29,7 @@ from poem_jax.training.config import DataParallel
 from poem_jax.training.journal import Journal
 from poem_jax.training.loop import STOP_EVERY, train
 from poem_jax.training.pictures import image_grid
+from poem_jax.training.run_report import Sitting
 from poem_jax.training.source import synthetic_batches
 from poem_jax.training.state import evaluation_params
 from poem_jax.training.stopping import stop_after_the_step
@@ -382,7 +383,7 @@ def test_several_hosts_ask_each_other_at_the_same_steps(micro_config, monkeypatc
         asked.append(flag)
         return True
 
-    run = SimpleNamespace(config=micro_config, sitting=SimpleNamespace(start=time.monotonic()))
+    run = SimpleNamespace(config=micro_config, sitting=Sitting(micro_config))
     stopped = threading.Event()
     should_stop = loop._Run._should_stop
     assert not should_stop(run, 1, stopped)
@@ -391,6 +392,7 @@ def test_several_hosts_ask_each_other_at_the_same_steps(micro_config, monkeypatc
     steps = [n for n in range(3 * STOP_EVERY) if should_stop(run, n, stopped)]
     assert steps == [0, STOP_EVERY, 2 * STOP_EVERY]
     assert asked == [False] * 3
+    assert run.sitting.stopped_early.startswith("stopped by another host")
 
 
 def test_a_second_signal_ends_at_once():

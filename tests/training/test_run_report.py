@@ -74,6 +74,13 @@ def test_every_end_is_reported(run, error, end):
     assert "<nan>" not in html(run)
 
 
+def test_a_host_that_another_stopped_says_so(run):
+    run.stopped_early = "stopped by another host"
+    with reported(run):
+        pass
+    assert report(run)["end"] == "stopped by another host"
+
+
 def test_a_finished_run_needs_no_command(run):
     run.step, run.left_out = 4, [1, 2]
     with reported(run):
