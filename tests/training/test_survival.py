@@ -16,7 +16,11 @@ from poem_jax.training.journal import METRICS, read_entries
 from tests.training import six_sets
 from tests.training.sittings import Blow, Sittings
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    # Orbax, of a checkpoint that is read as it lies there.
+    pytest.mark.filterwarnings("ignore:Sharding info not provided"),
+]
 
 KILLED = -9
 BLOWS = 20
