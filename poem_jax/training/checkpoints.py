@@ -18,9 +18,21 @@ from orbax.checkpoint import v1 as ocp
 
 from poem_jax.io.checksums import check_checksums, write_checksums
 from poem_jax.models.apply import init
-from poem_jax.training.checkpoint_errors import CheckpointNotWritten, names_damage, names_failed_write
+from poem_jax.training.checkpoint_errors import (
+    CheckpointDamaged,
+    CheckpointNotWritten,
+    names_damage,
+    names_failed_write,
+    names_unreadable,
+)
 from poem_jax.training.config import TrainConfig, flatten_config, git_commit
-from poem_jax.training.hosts import check_shared_folder, is_first_host, wait_for_all
+from poem_jax.training.hosts import (
+    as_on_first_host,
+    check_same_everywhere,
+    check_shared_folder,
+    is_first_host,
+    wait_for_all,
+)
 from poem_jax.training.identity import CONFIG_FILE, check_same_config, write_identity
 from poem_jax.training.keeping import NewestAndBest, Scores, what_is_scored
 from poem_jax.training.state import TrainState, create_state, evaluation_params
@@ -59,6 +71,7 @@ class Checkpoints:
         self._orbax = ocp.training.Checkpointer(
             str(self._place), preservation_policy=keep, cleanup_tmp_directories=not read_only
         )
+        self._check_same_steps()
         self._written: int | None = None
         """The step that is being written, or is written and has no checksums yet."""
 
@@ -165,21 +178,22 @@ class Checkpoints:
 
         One that is damaged, or has no checksums since the run ended while it was written, is named in a
         warning and set aside, and the one before it is taken: a run that goes on from there computes the
-        same. Only where none with checksums is left is the newest one taken unchecked, with a warning.
+        same. Only where none with checksums is left is the newest one taken unchecked, with a warning. A
+        checkpoint that is whole and cannot be read all the same stays where it is.
 
         Raises:
             FileNotFoundError: there is no checkpoint.
-            ValueError: none can be read, or their arrays do not fit `like`.
+            ValueError: none is whole, or the newest whole one cannot be read or does not fit `like`.
         """
         if not self.steps:
             raise FileNotFoundError(f"no checkpoint in {self._place}")
         problems: list[str] = []
-        checked = [step for step in self.steps if self._checksums(step).is_file()]
+        checked = as_on_first_host([step for step in self.steps if self._checksums(step).is_file()])
         unchecked = [step for step in self.steps if step not in checked]
         for step in checked + unchecked:
             try:
                 state = self.read(step, like)
-            except ValueError as error:
+            except CheckpointDamaged as error:
                 problems.append(str(error))
                 continue
             newer = [other for other in self.steps if other > step]
@@ -195,13 +209,19 @@ class Checkpoints:
         )
 
     def read(self, step: int, like: TrainState) -> TrainState:
-        """Read this checkpoint as `restore` does; `ValueError` if it is damaged or does not fit `like`."""
+        """Read this checkpoint as `restore` does.
+
+        Raises:
+            CheckpointDamaged: its files are not those that were written.
+            ValueError: they are, but cannot be read, or do not fit `like`.
+        """
         template = flatten(like)
+        checked = bool(as_on_first_host([self._checksums(step).is_file()])[0])
         with names_damage(step, self._place):
             # One host is enough: the files are the same for all.
             if is_first_host():
                 check_checksums(self._checksums(step), self._folder(step))
-        with names_damage(step, self._place):
+        with names_unreadable(step, self._place, checked=checked):
             leaves = self._orbax.load(step, template)
             check_leaves(leaves, template, f"checkpoint {step}")
         return unflatten(leaves, like)
@@ -223,6 +243,12 @@ class Checkpoints:
             _log.warning("it is now %s; training goes on from the checkpoint before it", folder)
         wait_for_all("checkpoints have been set aside")
         self._orbax.reload()
+        self._check_same_steps()
+
+    def _check_same_steps(self) -> None:
+        """Insist that all hosts see the same checkpoints; else some would wait for the others for ever."""
+        steps = ", ".join(map(str, self.steps)) or "none"
+        check_same_everywhere(f"checkpoints in {self._place} (this one sees {steps})", steps)
 
     def _folder(self, step: int) -> Path:
         return self._place / str(step)
@@ -239,10 +265,19 @@ def export_run(config: TrainConfig, path: str | Path, *, dtype: Any = np.float16
         config: the experiment; `train.out` names the run.
         path: folder to write; replaced if it exists.
         dtype: storage type of weights and statistics; None = float32.
+
+    Raises:
+        FileNotFoundError: the run has no checkpoint.
+        ValueError: the best one is damaged, or none can be read.
     """
     fresh = create_state(init(config.model, key=jax.random.key(0)), config)
     with Checkpoints(config.train.out, config, read_only=True) as checkpoints:
         best = checkpoints.best_step if config.train.keep_best else None
-        state = checkpoints.restore(fresh) if best is None else checkpoints.read(best, fresh)
+        try:
+            state = checkpoints.restore(fresh) if best is None else checkpoints.read(best, fresh)
+        except CheckpointDamaged as error:
+            raise ValueError(
+                f"the best {error}. --train.no-keep-best exports the newest one that is whole"
+            ) from error
     save(path, config.model, evaluation_params(state), dtype=dtype, overwrite=True)
     return int(state.step)

@@ -3,7 +3,7 @@
 import itertools
 import logging
 import re
-from collections.abc import Container, Iterator
+from collections.abc import Container
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from poem_jax.data.batching import collate
 from poem_jax.data.frames import CorruptSampleError
 from poem_jax.mixture.samples import FrameSamples, Mixture
 from poem_jax.training.config import TrainConfig
+from poem_jax.training.hosts import check_same_everywhere
 from poem_jax.training.source import open_training_data
 
 _log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ def held_out_batches(
 
     Raises:
         ValueError: none of a part's held-out frames can be used: they have one view each, say, in which the
-            model cannot place a hand.
+            model cannot place a hand; or one host can use others than another, whose batches would differ.
     """
     parts = () if config.data.mixture is None else config.data.mixture.parts
     if not any(part.held_out for part in parts):
@@ -44,7 +45,16 @@ def held_out_batches(
     largest = max(shape.batch_size for shape in config.data.batches)
     batches: dict[str, list[MultiViewBatch]] = {}
     for name, frames in mixture.held_out.items():
-        samples = list(_read(config, name, frames))
+        usable = _read(config, name, frames)
+        # Before one host alone says that it has none: the others would wait for it.
+        check_same_everywhere(f"held-out frames of {name} that can be used", str(list(usable)))
+        samples = list(usable.values())
+        if not samples:
+            raise ValueError(
+                f"none of {_count(config, frames)} held-out frames of {name} can be used; a "
+                f"{type(config.model).__name__} needs {_least_views(config)} views of a hand. Leave that "
+                "part's `held_out` at 0"
+            )
         size = min(largest, -(-len(samples) // multiple_of) * multiple_of)
         chunks = [samples[i : i + size] for i in range(0, len(samples), size)]
         batches[_free_name(re.sub(r"\W+", "_", name), batches)] = [
@@ -59,26 +69,27 @@ def _free_name(name: str, taken: Container[str]) -> str:
     return next(free for free in names if free not in taken)
 
 
-def _read(config: TrainConfig, name: str, frames: FrameSamples) -> Iterator[MultiViewBatch]:
-    """Yield samples; those that cannot be used are named and left out."""
-    count = min(len(frames.source), config.train.validation_samples)
-    least = 2 if config.model.triangulates else 1
-    found = 0
-    for index in np.linspace(0, len(frames.source) - 1, count).round().astype(int):
+def _read(config: TrainConfig, name: str, frames: FrameSamples) -> dict[int, MultiViewBatch]:
+    """Return samples by their place in the source; those that cannot be used are named and left out."""
+    usable = {}
+    for index in np.linspace(0, len(frames.source) - 1, _count(config, frames)).round().astype(int).tolist():
         try:
             # Nothing of the sample is left to chance; augmenting draws all the same.
-            sample = frames.sample(int(index), _most_views(config), np.random.default_rng(0))
+            sample = frames.sample(index, _most_views(config), np.random.default_rng(0))
         except CorruptSampleError as error:
             _log.warning("held-out sample of %s passed over: %s", name, error)
             continue
-        if len(sample.views) >= least:
-            found += 1
-            yield sample
-    if not found:
-        raise ValueError(
-            f"none of {count} held-out frames of {name} can be used; a {type(config.model).__name__} needs "
-            f"{least} views of a hand. Leave that part's `held_out` at 0"
-        )
+        if len(sample.views) >= _least_views(config):
+            usable[index] = sample
+    return usable
+
+
+def _count(config: TrainConfig, frames: FrameSamples) -> int:
+    return min(len(frames.source), config.train.validation_samples)
+
+
+def _least_views(config: TrainConfig) -> int:
+    return 2 if config.model.triangulates else 1
 
 
 def _filled(config: TrainConfig, samples: list[MultiViewBatch], size: int) -> MultiViewBatch:

@@ -145,6 +145,17 @@ def as_on_first_host(numbers: Sequence[int]) -> list[int]:
         return [int(number) for number in multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32))]
 
 
+def count_where(place: str) -> int:
+    """Return how many hosts name the same `place`, a machine, say, this one among them.
+
+    Raises:
+        HostLost: another host has ended.
+    """
+    if jax.process_count() == 1:
+        return 1
+    return sum(np.array_equal(digest, _digest(place)) for digest in _gather(place))
+
+
 def check_same_everywhere(what: str, text: str) -> None:
     """Insist that all hosts have the same `text`, their config, say.
 
@@ -154,14 +165,22 @@ def check_same_everywhere(what: str, text: str) -> None:
     """
     if jax.process_count() == 1:
         return
-    own = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
-    with names_lost_host():
-        of_hosts = multihost_utils.process_allgather(own)
+    of_hosts = _gather(text)
     others = [host for host, digest in enumerate(of_hosts) if not np.array_equal(digest, of_hosts[0])]
     if others:
         raise ValueError(
             f"all hosts must have the same {what}; hosts {others} have another than the first one"
         )
+
+
+def _gather(text: str) -> np.ndarray:
+    """Return the digests of all hosts' texts."""
+    with names_lost_host():
+        return multihost_utils.process_allgather(_digest(text))
+
+
+def _digest(text: str) -> np.ndarray:
+    return np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
 
 
 def check_shared_folder(folder: Path, option: str) -> None:

@@ -1,26 +1,36 @@
 """The state that a sitting begins with, and what the log says of it."""
 
+import hashlib
 import logging
+import os
+import socket
+from pathlib import Path
 
 import jax
+import numpy as np
 
 from poem_jax.models.apply import init
 from poem_jax.training.checkpoints import Checkpoints
 from poem_jax.training.config import TrainConfig, git_commit
+from poem_jax.training.hosts import check_same_everywhere, count_where
 from poem_jax.training.parallel import put_everywhere
 from poem_jax.training.state import TrainState, create_state
 from poem_jax.typing import Params
-from poem_jax.weights.store import SHIPPED, load
+from poem_jax.weights.store import SHIPPED, flatten, load
 
 log = logging.getLogger(__name__)
 
 
 def initial_state(config: TrainConfig, checkpoints: Checkpoints, mesh: jax.sharding.Mesh) -> TrainState:
     """Return the state of the newest checkpoint, or a fresh one, on every device of the mesh."""
-    state = create_state(_first_params(config), config)
+    params = _first_params(config)
+    if checkpoints.latest_step is None:
+        check_same_everywhere("weights to start from", _digest(params))
+    state = create_state(params, config)
     count = sum(leaf.size for leaf in jax.tree.leaves(state.params["trainable"]))
     state = put_everywhere(state, mesh)
     log.info("devices %s", [str(device) for device in mesh.devices.flat])
+    _warn_of_idle_gpus()
     log.info("%d trainable parameters", count)
     log.info("git commit %s", git_commit())
     log.info("config in %s", checkpoints.config_file)
@@ -35,3 +45,37 @@ def _first_params(config: TrainConfig) -> Params:
         folder = SHIPPED if config.train.init_from == "shipped" else config.train.init_from
         return load(folder, expected=config.model)[1]
     return init(config.model, key=jax.random.key(config.train.seed))
+
+
+def _digest(params: Params) -> str:
+    """Return what tells these weights from others; nothing where there is no other host to compare with."""
+    if jax.process_count() == 1:
+        return ""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(flatten(params).items()):
+        array = np.asarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+def _warn_of_idle_gpus() -> None:
+    """Launchers give each process one GPU: a job of one process a machine leaves the others idle."""
+    if jax.process_count() == 1 or jax.default_backend() != "gpu":
+        return
+    used = jax.local_device_count() * count_where(socket.gethostname())
+    there = _visible_gpus()
+    if used < there:
+        log.warning(
+            "%d of the %d GPUs of %s are used: JAX gives each process one where a launcher starts "
+            "them. Start one task a GPU",
+            used,
+            there,
+            socket.gethostname(),
+        )
+
+
+def _visible_gpus() -> int:
+    shown = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if shown is not None:
+        return len([name for name in shown.split(",") if name.strip()])
+    return len(list(Path("/dev").glob("nvidia[0-9]*")))

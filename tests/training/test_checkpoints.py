@@ -1,5 +1,6 @@
 """Checkpoints of a run: with checksums as soon as they are whole, and never trusted where they are not."""
 
+import errno
 import resource
 import shutil
 import time
@@ -13,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from poem_jax.training.checkpoint_errors import CheckpointNotWritten
-from poem_jax.training.checkpoints import Checkpoints
+from poem_jax.training import checkpoints as checkpoints_module
+from poem_jax.training.checkpoint_errors import CheckpointNotWritten, names_failed_write
+from poem_jax.training.checkpoints import Checkpoints, export_run
 from poem_jax.training.parallel import data_mesh, put_everywhere
 from poem_jax.training.state import TrainState
 
@@ -121,6 +123,65 @@ def test_when_none_can_be_read_all_are_named(micro_config, state, run_dir):
     ):
         restore(micro_config, state)
     assert (run_dir / "checkpoints" / "4").is_dir()
+
+
+def test_a_whole_checkpoint_that_cannot_be_read_is_no_reason_to_go_back(micro_config, state, run_dir):
+    """Another model here; no memory, in life. The files are as they were written, and stay."""
+    with pytest.raises(ValueError, match=r"checkpoint 4 in .* has the files that were written"):
+        restore(micro_config, state_of(99))
+    (run_dir / "seals" / "4.json").unlink()
+    with pytest.raises(ValueError, match=r"checkpoint 2 in .* Nothing has been moved"):
+        restore(micro_config, state_of(99))
+    assert not (run_dir / "damaged").exists()
+    assert int(restore(micro_config, state).step) == 2
+
+
+def test_checksums_that_cannot_be_compared_prove_no_damage(micro_config, state, run_dir, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(checkpoints_module, "check_checksums", fail)
+    with pytest.raises(ValueError, match=r"checkpoint 4 .* cannot be compared .*Input/output.* been moved"):
+        restore(micro_config, state)
+    assert not (run_dir / "damaged").exists()
+
+
+def test_hosts_that_see_other_checkpoints_are_refused(micro_config, run_dir, monkeypatch):
+    seen = []
+    monkeypatch.setattr(checkpoints_module, "check_same_everywhere", lambda *args: seen.append(args))
+    with Checkpoints(run_dir, micro_config):
+        assert [text for _, text in seen] == ["4, 2"]
+
+
+def test_the_first_host_decides_which_have_checksums(micro_config, state, run_dir, monkeypatch):
+    """This one's disk still shows those of step 4."""
+    monkeypatch.setattr(
+        checkpoints_module, "as_on_first_host", lambda own: [step for step in own if step != 4]
+    )
+    assert int(restore(micro_config, state).step) == 2
+    assert (run_dir / "damaged" / "4").is_dir()
+
+
+def test_a_damaged_best_one_is_not_exported_and_the_way_out_is_said(
+    micro_config, state, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(checkpoints_module, "init", lambda *_, **__: None)
+    monkeypatch.setattr(checkpoints_module, "create_state", lambda *_: state)
+    config = replace(micro_config, train=replace(micro_config.train, keep_best=True))
+    with Checkpoints(config.train.out, config) as checkpoints:
+        checkpoints.save(at_step(state, 2), score=1.0)
+        checkpoints.save(at_step(state, 4), score=2.0, wait=True)
+    cut_off(Path(config.train.out), 2)
+    with pytest.raises(ValueError, match=r"the best checkpoint 2 .* is damaged .*--train.no-keep-best exp"):
+        export_run(config, tmp_path / "model")
+
+
+def test_a_failed_write_is_named_where_the_folder_has_gone_too(tmp_path):
+    with (
+        pytest.raises(CheckpointNotWritten, match="what is free there cannot be told"),
+        names_failed_write(2, tmp_path / "gone"),
+    ):
+        raise OSError("Stale file handle")
 
 
 def test_an_empty_run_has_no_checkpoint(micro_config, state):

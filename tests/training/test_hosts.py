@@ -21,7 +21,7 @@ import pytest
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from poem_jax.training import hosts
+from poem_jax.training import hosts, initial_state
 from poem_jax.training.config import ComputeConfig
 from poem_jax.training.hosts import (
     HostLost,
@@ -116,6 +116,27 @@ def test_what_hosts_must_have_alike_is_compared(monkeypatch):
     check_same_everywhere("config", "a")
     with pytest.raises(ValueError, match=r"the same config; hosts \[1\] have another than the first one"):
         check_same_everywhere("config", "a")
+
+
+@pytest.mark.parametrize(
+    ("tasks", "shown", "idle"), [(1, "0,1,2,3", True), (4, "0,1,2,3", False), (4, "2", False)]
+)
+def test_gpus_that_no_task_takes_are_named(monkeypatch, caplog, tasks, shown, idle):
+    monkeypatch.setattr(jax, "process_count", lambda: 8)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_device_count", lambda: 1)
+    monkeypatch.setattr(initial_state, "count_where", lambda _: tasks)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
+    initial_state._warn_of_idle_gpus()
+    assert ("1 of the 4 GPUs of" in caplog.text) == idle
+
+
+def test_weights_to_start_from_are_told_apart_where_there_are_several_hosts(monkeypatch):
+    one, other = ({"trainable": {"weights": np.full(3, value, np.float32)}} for value in (0, 1))
+    assert initial_state._digest(one) == initial_state._digest(other) == ""
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    assert initial_state._digest(one) == initial_state._digest(jax.tree.map(np.copy, one))
+    assert initial_state._digest(one) != initial_state._digest(other)
 
 
 def test_what_the_first_host_sees_holds_for_all(monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 from poem_jax.batch import Prediction
 from poem_jax.data.view_sampling import UniformViews
 from poem_jax.mixture.config import CapturesSource, MixtureConfig, Part
+from poem_jax.training import held_out
 from poem_jax.training import validation as module
 from poem_jax.training.config import BatchShape
 from poem_jax.training.held_out import held_out_batches
@@ -100,6 +101,13 @@ def test_two_parts_whose_names_read_alike_are_both_watched(config):
     for samples, name in zip(mixture.parts, ("my rig", "my-rig", "my_rig"), strict=True):
         samples.source.name = name
     assert list(held_out_batches(config, mixture)) == ["my_rig", "my_rig_2", "my_rig_3"]
+
+
+def test_hosts_must_be_able_to_use_the_same_frames(config, monkeypatch):
+    seen = []
+    monkeypatch.setattr(held_out, "check_same_everywhere", lambda *args: seen.append(args))
+    held_out_batches(config)
+    assert seen == [("held-out frames of my rig that can be used", "[0, 1, 2, 3, 4]")]
 
 
 def test_samples_that_fill_a_batch_are_marked(config):
