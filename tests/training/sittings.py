@@ -131,6 +131,7 @@ def _serve() -> None:
     from orbax.checkpoint import v1  # noqa: F401
 
     import poem_jax.cli.run
+    import poem_jax.models.poem_v2
     import poem_jax.synthetic.dataset
     import poem_jax.training.loop  # noqa: F401
 
