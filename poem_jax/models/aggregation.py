@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from poem_jax.models.config import AggregationConfig, Design, Similarity
-from poem_jax.models.layers import linear
-from poem_jax.models.recompute import DecoderRow
+from poem_jax.models.layers import DecoderRow, linear
 from poem_jax.typing import Array, Bool, Float, Int
 
 _POINTS_AT_A_TIME = 512

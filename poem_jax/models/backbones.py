@@ -10,8 +10,7 @@ from flax import nnx
 from jax.core import Tracer
 
 from poem_jax.models.config import FrozenNorms, HRNetConfig, ResNetConfig, Stem
-from poem_jax.models.layers import ConvNorm, NormMode, repeat_pixels
-from poem_jax.models.recompute import TrunkRow
+from poem_jax.models.layers import ConvNorm, NormMode, TrunkRow, repeat_pixels
 from poem_jax.typing import Array, Float
 
 BOTTLENECK_EXPANSION = 4

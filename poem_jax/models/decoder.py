@@ -19,9 +19,8 @@ from poem_jax.geometry.transforms import matmul, rotate_points, transpose
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT
 from poem_jax.models.config import DecoderConfig, DecoderOutput, Design, JointDecoderConfig, NeighbourSearch
 from poem_jax.models.hand_output import palm_frame
-from poem_jax.models.layers import Exact, dropout, layer_norm, linear, normal
+from poem_jax.models.layers import DecoderRow, Exact, dropout, layer_norm, linear, normal
 from poem_jax.models.point_features import projected_features
-from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
     Neighbours,

@@ -11,8 +11,7 @@ from flax import nnx
 
 from poem_jax.models.decoder import PAPER_EPSILON, MultiHeadAttention
 from poem_jax.models.detr_config import DetrConfig
-from poem_jax.models.layers import dropout, layer_norm, linear
-from poem_jax.models.recompute import DecoderRow
+from poem_jax.models.layers import DecoderRow, dropout, layer_norm, linear
 from poem_jax.typing import Array, Bool, Float, PRNGKeyArray
 
 

@@ -6,12 +6,16 @@ convolutions as matrix products and enlargements as broadcasts, several times fa
 A layer computes in the number type of its weights, whatever it is given (`in_type_of_weights`), so that the
 weights alone say what a model computes in; `precision.py` casts them. `Exact` ones are never cast.
 
+What is inside the blocks of a `Row` can be computed again in the backward pass, instead of being kept for it:
+only what goes into a block is then kept, for the time of one more forward pass; the gradients are the same.
+
 Weights are drawn by NumPy, seeded by the JAX key: compiling JAX's generators for every shape of a large model
 takes a minute. Under a trace JAX draws them: other numbers of the same distribution.
 """
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -22,7 +26,6 @@ from jax.core import Tracer
 
 from poem_jax.models import winograd
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.recompute import TrunkRow
 from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
 
 BATCH_NORM_EPSILON = 1e-5
@@ -57,6 +60,38 @@ def in_type_of_weights(arrays: _Arrays, /, *, dtype: Any = None, inexact: bool =
     account."""
     kernel = arrays[1]
     return tuple(None if x is None else jnp.asarray(x, kernel.dtype) for x in arrays)  # pyright: ignore[reportReturnType]
+
+
+class Row(nnx.Module):
+    """What calls blocks one after the other."""
+
+    recomputed = False
+    """Whether the insides of its blocks are computed again."""
+
+    def run(self, block: Callable[..., Any], *args: Any) -> Any:
+        """Call a block, a module; a row among the blocks decides about its own."""
+        if not self.recomputed or isinstance(block, Row):
+            return block(*args)
+        return nnx.remat(lambda block: block(*args))(block)
+
+    def lean(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of arrays that keeps none of its inside, or as it is."""
+        return jax.checkpoint(function) if self.recomputed else function  # pyright: ignore[reportPrivateImportUsage]
+
+
+class TrunkRow(Row):
+    """A row in what is done with every view alone."""
+
+
+class DecoderRow(Row):
+    """A row in what joins the views to a hand."""
+
+
+def recompute(model: object, kinds: tuple[type[Row], ...]) -> None:
+    """Let all rows of these kinds compute the insides of their blocks again."""
+    for _, part in nnx.iter_graph(model) if kinds else ():
+        if isinstance(part, kinds):
+            part.recomputed = True
 
 
 def trunk_images(

@@ -78,6 +78,7 @@ from poem_jax.models.frustum import denormalised, sigmoid_step
 from poem_jax.models.hand_output import HandParameters
 from poem_jax.models.layers import (
     ConvNorm,
+    DecoderRow,
     Exact,
     NormMode,
     dropout,
@@ -90,7 +91,6 @@ from poem_jax.models.layers import (
 from poem_jax.models.mvp_config import NUM_LEVELS, MvpConfig, MvpDecoderConfig
 from poem_jax.models.network import Constant, HandConstants
 from poem_jax.models.point_features import valid_views_first
-from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.world_frame import Reconstruction, WorkingFrame, leave_working_frame
 from poem_jax.typing import Array, Bool, Float, Num, PRNGKeyArray
 

@@ -19,8 +19,7 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.layers import Exact, NormMode
-from poem_jax.models.recompute import Row, recompute
+from poem_jax.models.layers import Exact, NormMode, Row, recompute
 from poem_jax.models.systems import MODULES
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array, Float, Int, Num, Params, PRNGKeyArray, PyTree

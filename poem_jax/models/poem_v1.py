@@ -54,6 +54,7 @@ from poem_jax.models.frustum import frustum_grid
 from poem_jax.models.heat_maps import HeatMapBranch
 from poem_jax.models.layers import (
     Conv,
+    DecoderRow,
     NormMode,
     TopDownBranch,
     layer_norm,
@@ -82,7 +83,6 @@ from poem_jax.models.poem_v1_start import (
     space_of,
 )
 from poem_jax.models.point_features import projected_features, sine_code
-from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import Neighbours, VectorAttention, nearest_neighbours
 from poem_jax.models.world_frame import Reconstruction, WorkingFrame, leave_working_frame
 from poem_jax.typing import Array, Bool, Float, Int, Num, PRNGKeyArray

@@ -38,7 +38,7 @@ from poem_jax.models.frustum import (
     sigmoid_step,
 )
 from poem_jax.models.frustum_config import Cuboid
-from poem_jax.models.layers import Conv, NormMode, TopDownBranch, linear, max_pool, uniform
+from poem_jax.models.layers import Conv, DecoderRow, NormMode, TopDownBranch, linear, max_pool, uniform
 from poem_jax.models.network import Constant
 from poem_jax.models.poem_v1_config import (
     BasisFeatures,
@@ -48,7 +48,6 @@ from poem_jax.models.poem_v1_config import (
 )
 from poem_jax.models.poem_v1_start import Scene
 from poem_jax.models.point_features import ViewRowColumnCode
-from poem_jax.models.recompute import DecoderRow
 from poem_jax.models.vector_attention import BracketedVectorAttention, nearest_neighbours
 from poem_jax.typing import Array, Bool, Float, Int
 

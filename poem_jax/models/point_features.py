@@ -18,10 +18,10 @@ from poem_jax.models.layers import (
     ConvNorm,
     NormMode,
     TopDownBranch,
+    TrunkRow,
     at_least_float32,
     double_bilinear,
 )
-from poem_jax.models.recompute import TrunkRow
 from poem_jax.typing import Array, Bool, Float
 
 _TEMPERATURE = 10000.0

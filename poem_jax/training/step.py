@@ -19,9 +19,9 @@ from poem_jax.losses import (
     valid_masks,
     weighted,
 )
+from poem_jax.models.layers import DecoderRow, TrunkRow
 from poem_jax.models.network import forward
 from poem_jax.models.precision import cast_weights
-from poem_jax.models.recompute import DecoderRow, TrunkRow
 from poem_jax.training.accumulation import Part, add_up, in_parts
 from poem_jax.training.config import Precision, Rematerialise, RootSource, TrainConfig, TrainingRoot
 from poem_jax.training.state import TrainState, learning_rate, make_optimizer, update_average

@@ -13,10 +13,10 @@ from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand import default_hand
 from poem_jax.losses import RELEASE, Share, multi_view_losses
+from poem_jax.models.layers import DecoderRow, TrunkRow
 from poem_jax.models.network import describe, exact_weights, forward
 from poem_jax.models.precision import cast_weights
 from poem_jax.models.presets import PRESETS
-from poem_jax.models.recompute import DecoderRow, TrunkRow
 from poem_jax.training.accumulation import Part, add_up, in_parts
 from poem_jax.training.config import (
     ComputeConfig,
