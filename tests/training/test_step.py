@@ -22,8 +22,10 @@ from poem_jax.losses import match_keypoints
 from poem_jax.models import layers
 from poem_jax.training.config import (
     RELEASE_ROOT,
+    ComputeConfig,
     DataParallel,
     OptimizerConfig,
+    Rematerialise,
     RootSource,
     RunConfig,
     Schedule,
@@ -150,6 +152,23 @@ def test_any_split_over_devices_gives_the_result_of_one(drawn_params, config, mi
         assert state.params["trainable"]["decoder"]["embeddings"].is_deleted()  # donated
         for name, value in want_metrics.items():
             np.testing.assert_allclose(metrics[name], value, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_parts_of_every_devices_share_are_those_of_one(drawn_params, config, micro_batch):
+    """Also where insides are computed again, the batch norms' sums over devices with them."""
+    mesh = data_mesh(jax.devices()[:2])
+    assert mesh.size == 2
+    batch = uneven(micro_batch)
+    in_two = replace(config, compute=ComputeConfig(accumulate=2))
+    want, want_metrics = one_device(in_two)(create_state(drawn_params, in_two), batch, KEY)
+    lean = replace(in_two, compute=replace(in_two.compute, rematerialise=Rematerialise.BOTH))
+    state = jax.device_put(create_state(drawn_params, lean), replicated(mesh))
+    key = jax.device_put(KEY, replicated(mesh))
+    got, metrics = compile_step(lean, mesh)(state, put_batch(batch, mesh), key)
+    compare(got, want)
+    for name, value in want_metrics.items():
+        np.testing.assert_allclose(metrics[name], value, rtol=1e-4, err_msg=name)
 
 
 @pytest.mark.slow
