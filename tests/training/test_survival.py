@@ -30,7 +30,7 @@ SOON_S = 60
 """For a worker to draw the sample at hand; it takes less than a tenth of one."""
 FULL_AT = 2**16
 """Bytes of the largest file on a full disk: less than those of a checkpoint, more than all others have."""
-OF_TIME = ("seconds", "samples_per_second", "data_wait_share", "memory", "time")
+OF_TIME = ("seconds", "per_second", "data_wait_share", "memory", "time")
 """In the names of metrics that no two runs share."""
 
 
