@@ -6,6 +6,7 @@ as good as fresh; it runs one sitting at a time. The first sitting leaves its tr
 """
 
 import json
+import logging
 import os
 import pickle
 import resource
@@ -157,6 +158,8 @@ def _sit(arguments: list[str], log: str, program: str, blow: dict | None, larges
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
     if blow is not None:
         Blow(**blow).await_it()
+    # What was imported has set up logging, which a command does itself.
+    logging.getLogger().handlers.clear()
     sys.argv = ["poem", "train", *arguments]
     sys.exit(main(sys.argv[1:]))
 
