@@ -85,6 +85,7 @@ def test_the_released_rates_are_halved_once(stored):
     begin = Plateau(jnp.asarray([1e-2, 1e-3, 1e-2]), jnp.asarray(jnp.inf), jnp.asarray(0))
     _, rates = jax.lax.scan(step, begin, jnp.asarray(losses, jnp.float32))
     np.testing.assert_allclose(rates, stored.golden["lr"], rtol=1e-6)
+    np.testing.assert_allclose(rates_of(losses, ADAM_300_RELEASE), stored.golden["lr"], rtol=1e-6)
 
 
 @pytest.mark.parity

@@ -81,7 +81,12 @@ def steps() -> list:
     alike: dict[tuple, list[str]] = {}
     for name in EXPERIMENTS:
         config = open_experiment(name)
-        step = (config.model, config.loss, config.training_root, config.compute, config.frozen_views)
+        optimizer, shape = config.optimizer, abstract_batch(config).views.shape
+        step = (
+            (config.model, config.loss, config.training_root, config.compute, config.frozen_views, shape),
+            (config.first_stage_steps > 0, bool(optimizer.ema_decay), bool(optimizer.weight_decay)),
+            optimizer.clip,
+        )
         alike.setdefault(step, []).append(name)
     return [
         pytest.param(
@@ -89,7 +94,7 @@ def steps() -> list:
             id=" ".join(names),
             marks=[pytest.mark.slow] if isinstance(model.backbone, HRNetConfig) else [],
         )
-        for (model, *_), names in alike.items()
+        for ((model, *_), *_), names in alike.items()
     ]
 
 

@@ -105,21 +105,6 @@ def _resolve_under_mesh(rerun: Rerun, run: Run) -> Run:
     return rerun(kept)
 
 
-def hang_on_ties(run: Run, model: str) -> np.ndarray:
-    """Say which points (batch, query) of the last block another end of the swapped searches may move.
-
-    Those are the queries whose own search was swapped, and those that read a query moved in the block before;
-    of the parametric model all, since its mesh hangs on every query.
-    """
-    own = run.swapped.any(0)
-    if model == PARAMETRIC:
-        return np.broadcast_to(own.any(-1, keepdims=True), own.shape)
-    moved = run.swapped[SEARCHES[1]].any(0)
-    among_queries = run.index[SEARCHES[2]][1]
-    reads_moved = np.stack([row[index].any(-1) for row, index in zip(moved, among_queries, strict=True)])
-    return own | reads_moved
-
-
 def assert_only_ties(run: Run) -> None:
     """Few searches were swapped, all of them between neighbours as good as equally near."""
     assert run.swapped.sum() <= MAX_SWAPS
