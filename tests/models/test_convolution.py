@@ -5,6 +5,7 @@ import pytest
 from flax import nnx
 
 from poem_jax.models.layers import Conv
+from tests.precision import convolve_by_products
 
 
 @pytest.mark.parametrize("size", [1, 3, 7])
@@ -21,6 +22,8 @@ def test_convolution_is_a_sum_over_windows(size, stride):
             window = padded[0, i * stride : i * stride + size, j * stride : j * stride + size]
             expected[0, i, j] = np.einsum("hwc,hwcd->d", window, kernel)
     np.testing.assert_allclose(conv(jnp.asarray(x)), expected, atol=1e-5)
+    by_products = convolve_by_products(jnp.asarray(x), conv.kernel[...], stride)
+    np.testing.assert_allclose(by_products, expected, atol=1e-5)
 
 
 def test_first_weights_keep_the_variance():

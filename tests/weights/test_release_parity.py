@@ -44,7 +44,7 @@ from tests.weights.ties import (
     FARTHEST_M,
     PARAMETRIC,
     SHARE,
-    Rerun,
+    Halves,
     Run,
     assert_only_ties,
     assert_points_agree,
@@ -86,9 +86,10 @@ def close(ours: np.ndarray, theirs: np.ndarray, atol: float) -> None:
 # Final outputs, float32.
 
 
-@functools.lru_cache(maxsize=1)
-def rerun(case: Case) -> Rerun:
-    return Rerun(case.model, batch_of(case.inputs), case.stored["all_coords_preds"])
+@functools.cache
+def halves(case: Case) -> Halves:
+    batch = batch_of(case.inputs)
+    return Halves(case.model, batch, known_root(batch))
 
 
 def is_by_apply(case: Case) -> bool:
@@ -100,7 +101,7 @@ def is_by_apply(case: Case) -> bool:
 @functools.cache
 def predicted(case: Case) -> Prediction:
     if not is_by_apply(case):
-        return rerun(case).unchanged.prediction
+        return halves(case).unchanged.prediction
     config, params = released(case.model)
     batch = batch_of(case.inputs)
     prediction = poem_jax.apply(
@@ -118,7 +119,7 @@ def final(case: Case) -> Prediction:
 
 @functools.cache
 def resolved(case: Case) -> Run:
-    return resolve(rerun(case))
+    return resolve(halves(case), case.stored["all_coords_preds"])
 
 
 def share_within(case: Case, prediction: Prediction, block: int) -> float:
@@ -257,7 +258,7 @@ def test_no_point_is_far_before_ties_are_resolved(case: Case) -> None:
 def test_apply_is_its_halves_but_for_ties(case: Case) -> None:
     """So what is said of the halves, whose ties can be resolved, holds for what users run."""
     batch, whole = batch_of(case.inputs), predicted(case)
-    run = resolve(Rerun(case.model, batch, whole.layers_world))
+    run = resolve(halves(case), whole.layers_world)
     assert_only_ties(run)
     seen = batch.cameras.view_mask
     close(run.prediction.keypoints_px[seen], whole.keypoints_px[seen], KEYPOINT_PX)

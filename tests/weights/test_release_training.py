@@ -25,15 +25,17 @@ from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.losses import RELEASE, multi_view_losses
-from poem_jax.models import vector_attention
+from poem_jax.models import layers, vector_attention
 from poem_jax.models.backbones import Stack
 from poem_jax.models.config import Config
+from poem_jax.models.layers import TrunkRow
 from poem_jax.models.network import forward
 from poem_jax.training.state import clip_each_tensor
 from poem_jax.typing import Array, Params
 from poem_jax.weights.name_table import write_rows
 from poem_jax.weights.release_keys import unused_shapes, used_rows
 from poem_jax.weights.store import flatten
+from tests.precision import convolve_by_products
 from tests.weights.procedural import (
     IMAGE_HW,
     REFERENCE,
@@ -43,7 +45,7 @@ from tests.weights.procedural import (
     needs_reference,
     released,
 )
-from tests.weights.ties import Rerun, Run, assert_only_ties, assert_points_agree, limit_m, resolve
+from tests.weights.ties import Halves, Run, assert_only_ties, assert_points_agree, limit_m, resolve
 
 pytestmark = [needs_reference, pytest.mark.parity]
 
@@ -79,7 +81,7 @@ def resolved() -> Run:
     """The forward run with running statistics, its ties resolved as in the stored run."""
     batch = batch_of("G")
     points = stored()["evalmod_all_coords_preds"]
-    return resolve(Rerun("small", batch, points, batch.joints_world[:, ROOT_JOINT]))
+    return resolve(Halves("small", batch, batch.joints_world[:, ROOT_JOINT]), points)
 
 
 @functools.cache
@@ -89,8 +91,10 @@ def step(train: bool) -> Step:
     neighbours = iter(() if train else resolved().index)
     params, batch = (jax.tree.map(in_float64, tree) for tree in (params, batch_of("G")))
     with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
-        # In a loop, the gradients of convolutions are very slow on a CPU.
-        patch.setattr(Stack, "__call__", Stack.unrolled)
+        patch.setattr(layers, "convolve", convolve_by_products)
+        # Training unrolls the blocks for the sake of its convolutions, which are products here. They would
+        # take 12 GB, and not 9, were the insides of the trunk's blocks kept.
+        patch.setattr(Stack, "__call__", Stack.scanned)
         if not train:
             patch.setattr(vector_attention, "nearest", lambda queries, points, k: next(neighbours))
         run = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames=("config", "train"))
@@ -119,6 +123,7 @@ def loss(
         config=config,
         root_world=batch.joints_world[:, ROOT_JOINT],
         train=train,
+        recomputed=(TrunkRow,),
     )
     total, terms = multi_view_losses(
         prediction,

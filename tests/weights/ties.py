@@ -16,7 +16,7 @@ from poem_jax.batch import MultiViewBatch, Prediction
 from poem_jax.hand.topology import NUM_QUERIES
 from poem_jax.models.world_frame import enter_working_frame
 from tests.weights.halves import find_hands, look_in_parts
-from tests.weights.procedural import known_root, released
+from tests.weights.procedural import released
 
 PARAMETRIC = "medium_MANO"
 SHARE, FARTHEST_M = 0.995, 5e-3
@@ -46,16 +46,14 @@ def limit_m(model: str, block: int) -> float:
     return 1e-4 if model == PARAMETRIC and block == 2 else 2e-5
 
 
-class Rerun:
-    """The second half of a model on a batch, for a choice of ties; the first half runs once."""
+class Halves:
+    """A released model on a batch, run in two halves: the first once, the second for a choice of ties."""
 
-    def __init__(self, model: str, batch: MultiViewBatch, stored: np.ndarray, root_world=None) -> None:
-        """`stored`: the points of all blocks of the run to compare with."""
-        self.model, self.batch, self.stored = model, batch, stored
+    def __init__(self, model: str, batch: MultiViewBatch, root_world: np.ndarray | None = None) -> None:
+        self.model = model
         self.config, self.params = released(model)
         self.seen = look_in_parts(self.params, batch.views, config=self.config)
-        root = known_root(batch) if root_world is None else root_world
-        self.frame = enter_working_frame(batch.views, batch.cameras, root, np.float32)
+        self.frame = enter_working_frame(batch.views, batch.cameras, root_world, np.float32)
 
     def __call__(self, swapped: np.ndarray) -> Run:
         prediction, gaps, heard = find_hands(self.params, self.seen, self.frame, swapped, config=self.config)
@@ -65,26 +63,30 @@ class Rerun:
     @functools.cached_property
     def unchanged(self) -> Run:
         """The run with all ties as they fall."""
-        return self(np.zeros((4, len(self.stored), NUM_QUERIES), bool))
-
-    def distances(self, run: Run, block: int) -> np.ndarray:
-        return np.linalg.norm(run.prediction.layers_world[:, block] - self.stored[:, block], axis=-1)
+        return self(np.zeros((4, len(self.frame.known_root), NUM_QUERIES), bool))
 
 
-def resolve(rerun: Rerun) -> Run:
-    """Swap the ties of the queries that are off, block by block."""
-    run = rerun.unchanged
+def resolve(halves: Halves, stored: np.ndarray) -> Run:
+    """Swap the ties of the queries that are off, block by block.
+
+    `stored`: the points (batch, block, 799, 3) of the run to compare with.
+    """
+    run = halves.unchanged
     for block, searches in SEARCHES.items():
-        if rerun.model == PARAMETRIC and block == 2:
-            return _resolve_under_mesh(rerun, run)
+        if halves.model == PARAMETRIC and block == 2:
+            return _resolve_under_mesh(halves, run, stored)
         gaps, swapped = run.gaps[searches], run.swapped.copy()
-        off = rerun.distances(run, block) > limit_m(rerun.model, block)
+        off = _distances(run, stored, block) > limit_m(halves.model, block)
         swapped[searches] = (gaps < TIE) & (gaps == gaps.min(0)) & off
-        run = rerun(swapped)
+        run = halves(swapped)
     return run
 
 
-def _resolve_under_mesh(rerun: Rerun, run: Run) -> Run:
+def _distances(run: Run, stored: np.ndarray, block: int) -> np.ndarray:
+    return np.linalg.norm(run.prediction.layers_world[:, block] - stored[:, block], axis=-1)
+
+
+def _resolve_under_mesh(halves: Halves, run: Run, stored: np.ndarray) -> Run:
     """Resolve the ties of the parametric model's last block.
 
     Its queries are not stored, only the mesh, which hangs on all of them: swap one tie of every sample at a
@@ -92,17 +94,17 @@ def _resolve_under_mesh(rerun: Rerun, run: Run) -> Run:
     """
     samples = np.arange(run.gaps.shape[1])
     gaps = np.swapaxes(run.gaps[SEARCHES[2]], 0, 1).reshape(len(samples), -1)
-    kept, error = run.swapped, np.sum(rerun.distances(run, 2) ** 2, -1)
+    kept, error = run.swapped, np.sum(_distances(run, stored, 2) ** 2, -1)
     for places in np.argsort(gaps, axis=1)[:, : np.max(np.sum(gaps < TIE_UNDER_MESH, 1))].T:
-        if np.sqrt(error.max()) <= limit_m(rerun.model, 2):
+        if np.sqrt(error.max()) <= limit_m(halves.model, 2):
             break
         swapped = kept.copy()
         is_tie = gaps[samples, places] < TIE_UNDER_MESH
         swapped[SEARCHES[2]][places // NUM_QUERIES, samples, places % NUM_QUERIES] |= is_tie
-        trial = np.sum(rerun.distances(rerun(swapped), 2) ** 2, -1)
+        trial = np.sum(_distances(halves(swapped), stored, 2) ** 2, -1)
         kept = np.where((trial < error)[:, None], swapped, kept)
         error = np.minimum(trial, error)
-    return rerun(kept)
+    return halves(kept)
 
 
 def assert_only_ties(run: Run) -> None:
