@@ -36,8 +36,14 @@ def set_up_logging() -> None:
     """Show the package's warnings with the prefix `poem:`, and what it is doing without."""
     handler = logging.StreamHandler()
     handler.setFormatter(_Formatter())
+    handler.addFilter(_is_not_raised_too)
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     logging.getLogger("poem_jax").setLevel(logging.INFO)
+
+
+def _is_not_raised_too(record: logging.LogRecord) -> bool:
+    """Leave out what Orbax logs of an error, once in every thread that it passes before it reaches us."""
+    return not (record.exc_info and "orbax" in Path(record.pathname).parts)
 
 
 class _Formatter(logging.Formatter):

@@ -180,6 +180,7 @@ def test_a_full_disk_ends_a_run_that_goes_on_when_there_is_room(folder, sittings
     status, words = sittings.run(*command(folder, run), largest_file=FULL_AT)
     assert status == 2
     assert re.search(rf"poem: error: checkpoint {six_sets.STEPS} in .* could not be written .* MiB of", words)
+    assert "Traceback" not in words
     after = newest(run)
     assert all(leaf.tobytes() == after[name].tobytes() for name, leaf in before.items())
     finished(folder, sittings, run)
