@@ -38,13 +38,11 @@ test-browser: setup
 	$(BIN)/python -m pytest -m browser
 
 # Programs are compiled here as users' are; in the other suites LLVM optimises nothing.
-# What takes longest begins first, here and in the slow suite.
 test-parity: setup
-	XLA_FLAGS=--xla_force_host_platform_device_count=2 $(PYTEST) -m parity --dist loadfile --no-loadscope-reorder \
-		tests/weights/test_release_training.py tests/models tests
+	XLA_FLAGS=--xla_force_host_platform_device_count=2 $(PYTEST) -m parity --dist loadfile --no-loadscope-reorder
 
 test-slow: setup
-	$(PYTEST) -m slow tests/training tests
+	$(PYTEST) -m slow --dist worksteal
 
 lint: setup
 	$(BIN)/ruff check .

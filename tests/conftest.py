@@ -39,6 +39,25 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(_own_cache, ignore_errors=True)
 
 
+_LONGEST = (
+    "test_survival.py",
+    "test_release_parity.py",
+    "test_release_training.py",
+    "test_plain_form.py",
+    "test_v1_poem_parity.py",
+    "test_v1_import.py",
+    "test_every_preset_learns.py",
+    "test_hosts.py",
+)
+"""Minutes each."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that no worker is left alone with one."""
+    places = {name: place for place, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.name, len(places)))
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

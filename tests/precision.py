@@ -1,6 +1,5 @@
-"""Comparisons in float64, and what the products of a traced program are computed in."""
+"""Comparisons in float64, quicker convolutions for them, and what a traced program multiplies in."""
 
-import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -42,15 +41,14 @@ def convolve_by_products(x: Array, kernel: Array, stride: int = 1) -> Array:
 
     XLA:CPU computes the gradients of products in float64 several times as fast as those of convolutions.
     """
-    return _sum_over_windows(stride, x, kernel)
+    pad = (len(kernel) - 1) // 2
 
+    @jax.checkpoint
+    def sum_over_windows(x: Array, kernel: Array) -> Array:
+        """The windows, many times as large as the image, are not kept for the gradient."""
+        size, (h, w) = len(kernel), x.shape[1:3]
+        x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
+        windows = [x[:, i : i + h : stride, j : j + w : stride] for i, j in np.ndindex(size, size)]
+        return jnp.concatenate(windows, -1) @ kernel.reshape(-1, kernel.shape[-1])
 
-@functools.partial(jax.checkpoint, static_argnums=0)
-def _sum_over_windows(stride: int, x: Array, kernel: Array) -> Array:
-    """The windows, which are many times as large as the image, are not kept for the gradient."""
-    size, (h, w) = len(kernel), x.shape[1:3]
-    pad = (size - 1) // 2
-    x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-    ends = [[start + length + 2 * pad - size + 1 for start in range(size)] for length in (h, w)]
-    windows = [x[:, i : ends[0][i] : stride, j : ends[1][j] : stride] for i, j in np.ndindex(size, size)]
-    return jnp.concatenate(windows, -1) @ kernel.reshape(-1, kernel.shape[-1])
+    return sum_over_windows(x, kernel)

@@ -1,10 +1,12 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
-from poem_jax.models.layers import Conv
+from poem_jax.models.layers import Conv, convolve
 from tests.precision import convolve_by_products
 
 
@@ -22,8 +24,22 @@ def test_convolution_is_a_sum_over_windows(size, stride):
             window = padded[0, i * stride : i * stride + size, j * stride : j * stride + size]
             expected[0, i, j] = np.einsum("hwc,hwcd->d", window, kernel)
     np.testing.assert_allclose(conv(jnp.asarray(x)), expected, atol=1e-5)
-    by_products = convolve_by_products(jnp.asarray(x), conv.kernel[...], stride)
-    np.testing.assert_allclose(by_products, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [1, 3, 7])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_it_and_its_gradients_are_those_of_products(size, stride):
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        x, kernel = rng.normal(size=(2, 8, 6, 2)), rng.normal(size=(size, size, 2, 3))
+        whole, products = (
+            jax.vjp(functools.partial(form, stride=stride), x, kernel)
+            for form in (convolve, convolve_by_products)
+        )
+        np.testing.assert_allclose(products[0], whole[0], atol=1e-12)
+        gradient = rng.normal(size=whole[0].shape)
+        for ours, theirs in zip(products[1](gradient), whole[1](gradient), strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
 
 def test_first_weights_keep_the_variance():

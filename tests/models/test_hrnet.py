@@ -6,7 +6,7 @@ from flax import nnx
 
 from poem_jax.models.backbones import BasicBlock, HRNet, Stack
 from poem_jax.models.config import HRNetConfig
-from poem_jax.models.layers import NormMode
+from poem_jax.models.layers import NormMode, TrunkRow, recompute
 
 
 def test_the_papers_trunk_has_the_published_size():
@@ -41,6 +41,25 @@ def test_loop_and_unrolled_blocks_agree(stack, mode):
     np.testing.assert_allclose(looped.scanned(X, mode), unrolled.unrolled(X, mode), atol=1e-5)
     for a, b in zip(jax.tree.leaves(nnx.state(looped)), jax.tree.leaves(nnx.state(unrolled)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_loop_and_unrolled_blocks_have_the_same_gradients(stack):
+    """Of images and weights, in training; also where the loop computes its insides again."""
+    graph, weights = nnx.split(stack)
+
+    def gradients(run, recomputed=()):
+        def loss(weights, x):
+            stack = nnx.merge(graph, weights)
+            recompute(stack, recomputed)
+            return jnp.sum(run(stack, x, NormMode(np.ones(2, bool))) ** 2)
+
+        return jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1)))(weights, X))
+
+    unrolled = gradients(Stack.unrolled)
+    for looped in (gradients(Stack.scanned), gradients(Stack.scanned, (TrunkRow,))):
+        for a, b in zip(looped, unrolled, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * np.abs(b).max())
+    assert np.any(unrolled[-1])
 
 
 def test_blocks_of_a_stack_differ(stack):

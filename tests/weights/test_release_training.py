@@ -9,6 +9,11 @@ then others, for rounding moves the points of block 0 by 5e-5 m (else by 1e-6 m)
 off by 1.5e-4 in the losses and by 2.7e-2 in the norms (the median by 0.7e-2); our own float32 run is off from
 our float64 run by 1e-3 and 0.1 (the median by 4e-2). So it is float32, and not the network, that sets the
 tolerances there.
+
+In float64 a CPU is slow at the gradients of convolutions and quick at those of products, so convolutions are
+matrix products here, in loops over blocks whose insides are computed again (kept, they take 12 GB and not 9).
+That these have the gradients of what users run is for `test_convolution.py`, `test_hrnet.py` and
+`test_compute.py`.
 """
 
 import functools
@@ -92,8 +97,6 @@ def step(train: bool) -> Step:
     params, batch = (jax.tree.map(in_float64, tree) for tree in (params, batch_of("G")))
     with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
         patch.setattr(layers, "convolve", convolve_by_products)
-        # Training unrolls the blocks for the sake of its convolutions, which are products here. They would
-        # take 12 GB, and not 9, were the insides of the trunk's blocks kept.
         patch.setattr(Stack, "__call__", Stack.scanned)
         if not train:
             patch.setattr(vector_attention, "nearest", lambda queries, points, k: next(neighbours))

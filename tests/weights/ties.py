@@ -49,7 +49,7 @@ def limit_m(model: str, block: int) -> float:
 class Halves:
     """A released model on a batch, run in two halves: the first once, the second for a choice of ties."""
 
-    def __init__(self, model: str, batch: MultiViewBatch, root_world: np.ndarray | None = None) -> None:
+    def __init__(self, model: str, batch: MultiViewBatch, root_world: np.ndarray | None) -> None:
         self.model = model
         self.config, self.params = released(model)
         self.seen = look_in_parts(self.params, batch.views, config=self.config)

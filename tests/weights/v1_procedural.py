@@ -179,22 +179,6 @@ def batch_of(case: str) -> MultiViewBatch:
     )
 
 
-def pad_batch(batch: MultiViewBatch, num_views: int) -> MultiViewBatch:
-    """Append empty views to all samples."""
-
-    def pad(values: np.ndarray) -> np.ndarray:
-        missing = num_views - values.shape[1]
-        return np.concatenate(
-            [values, np.zeros_like(values, shape=(len(values), missing, *values.shape[2:]))], 1
-        )
-
-    return batch._replace(
-        views=pad(batch.views),
-        cameras=Cameras(*map(pad, batch.cameras)),
-        keypoints_px=pad(batch.keypoints_px),
-    )
-
-
 def load_rows(model: nnx.Module, rows: list[NameRow], state: dict[str, np.ndarray]) -> None:
     """Put a released state dict into a model in place, by its table, which must fill every weight."""
     variables = {
