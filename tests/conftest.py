@@ -33,6 +33,14 @@ if _CACHE not in os.environ and importlib.util.find_spec("filelock"):
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 
+def pytest_configure() -> None:
+    """Keep JAX from measuring the folder, which never gets full, before it adds a program: with 1,600 in it
+    that takes a fifth of a second."""
+    from jax._src.lru_cache import LRUCache
+
+    LRUCache._evict_if_needed = lambda cache, **_: None
+
+
 def pytest_unconfigure() -> None:
     """Remove the compiled programs; workers found the folder made, and leave it."""
     if _own_cache is not None:
