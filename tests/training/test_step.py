@@ -110,7 +110,8 @@ def test_overfits_one_batch(micro_params, config, batch_at):
 @pytest.mark.slow
 def test_eight_devices():
     """The tests of a split over devices, of which the suite has two, in a process that has eight."""
-    devices = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "PJRT_NPROC": "12"}
+    flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=8")
+    devices = {"XLA_FLAGS": flags, "PJRT_NPROC": "12"}
     ran = subprocess.run(
         [sys.executable, "-m", "pytest", "-n", "0", "-m", "", "-k", "split or belongs", __file__],
         env=os.environ | devices,
