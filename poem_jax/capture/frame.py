@@ -53,6 +53,10 @@ class HandResult(NamedTuple):
     """Mean distance of the projected joints to the 2D evidence in each photograph; NaN = none there."""
     joints_shown: Float[Array, " view"] | None = None
     """Share of the joints that the view's lens shows; NaN = view not used."""
+    joint_confidence: Float[Array, "view 21"] | None = None
+    """How far each view's picture of each joint bears the result out, 0 to 1; NaN = not seen there."""
+    bridged: bool = False
+    """Whether the hand was not seen at this moment, and stands between those before and after it."""
 
 
 class Frame(NamedTuple):
@@ -75,5 +79,7 @@ class Frame(NamedTuple):
     crops: tuple[HandCrops | None, ...] = ()
     """One per hand; None where there is a reason against it."""
     hands: tuple[HandResult, ...] = ()
+    time_s: float | None = None
+    """Seconds since the take began, by the cameras' common clock; None = only the order is known."""
     warnings: tuple[str, ...] = ()
     """What was noticed at this frame and is true of more than it."""
