@@ -19,7 +19,7 @@ import numpy as np
 from poem_jax.calibration.assemble import Calibration, FileCamera, from_centres, pose, to_centres
 from poem_jax.calibration.camera_values import (
     entry,
-    image_size,
+    image_size_of,
     intrinsics,
     numbers,
     rotation_or_vector,
@@ -112,7 +112,7 @@ def _camera(table: Mapping[str, Any], key: str, path: Path) -> FileCamera:
     dist = lens_terms(table.get("distortions", []), f"{where}: `distortions`", fisheye)
     R = rotation_or_vector(table["rotation"], where)
     t = translation(table["translation"], where)
-    return FileCamera(name, image_size(*size, where), K, dist, pose(R, t))
+    return FileCamera(name, image_size_of(size, where), K, dist, pose(R, t))
 
 
 def _table(value: Any) -> Mapping[str, Any]:

@@ -5,7 +5,7 @@ that a message begins with. A value whose meaning can be guessed but not known, 
 of a matrix, is refused with what to do; one that has a single meaning, as `t` as a column, is read.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,12 @@ def image_size(width: Any, height: Any, where: str) -> tuple[int, int]:
             f"{short(height)}"
         )
     return int(width), int(height)
+
+
+def image_size_of(sides: Sequence[Any], where: str) -> tuple[int, int]:
+    """Return a list of width and height as whole pixels."""
+    width, height = sides
+    return image_size(width, height, where)
 
 
 def intrinsics(value: Any, where: str) -> Float[Array, "3 3"]:

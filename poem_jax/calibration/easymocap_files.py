@@ -15,7 +15,7 @@ import numpy as np
 from poem_jax.calibration.assemble import Calibration, FileCamera, from_centres, pose, to_centres
 from poem_jax.calibration.camera_values import (
     entry,
-    image_size,
+    image_size_of,
     intrinsics,
     number,
     numbers,
@@ -131,7 +131,7 @@ def _camera(
     sides = [intri.get(f"{side}_{name}") for side in "WH"]
     size = None
     if None not in sides:
-        size = image_size(*(number(side, f"{lens}: the size") for side in sides), lens)
+        size = image_size_of([number(side, f"{lens}: the size") for side in sides], lens)
     t = translation(entry(extri, f"T_{name}", place), place)
     return FileCamera(name, size, K, dist, pose(_rotation(name, extri, place), t))
 

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from poem_jax.calibration.assemble import Calibration, FileCamera, from_centres, pose, to_centres
-from poem_jax.calibration.camera_values import entry, image_size, intrinsics, numbers, rotation, short
+from poem_jax.calibration.camera_values import entry, image_size_of, intrinsics, numbers, rotation, short
 from poem_jax.calibration.documents import Document, Syntax
 from poem_jax.calibration.lens_values import lens_terms
 from poem_jax.calibration.refusals import check_no_skew, check_term_count
@@ -111,7 +111,7 @@ def _camera(camera: Mapping[str, Any], name: str, where: str, T: Array) -> FileC
     terms = [] if lens == "none" else entry(camera, "distortion_coeffs", where)
     dist = lens_terms(terms, f"{where}: `distortion_coeffs`", lens == "equidistant")
     size = numbers(entry(camera, "resolution", where), (2,), f"{where}: `resolution`").tolist()
-    return FileCamera(name, image_size(*size, where), K, dist, T)
+    return FileCamera(name, image_size_of(size, where), K, dist, T)
 
 
 def _rigid(value: Any, where: str) -> Array:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from poem_jax.calibration.assemble import Calibration, FileCamera, from_centres, pose, to_centres
-from poem_jax.calibration.camera_values import entry, image_size, intrinsics, number, numbers, rotation
+from poem_jax.calibration.camera_values import entry, image_size_of, intrinsics, number, numbers, rotation
 from poem_jax.calibration.documents import Document, Syntax
 from poem_jax.calibration.lens_values import lens_terms
 from poem_jax.calibration.refusals import check_no_fisheye, check_term_count
@@ -68,6 +68,8 @@ def _camera(content: Mapping[str, Any], path: Path) -> FileCamera:
     R = rotation(place[:, :3].tolist(), f"{where}: `CameraMatrix`")
     sides = [values.get(key) for key in ("ImageWidth", "ImageHeight")]
     size = (
-        None if None in sides else image_size(*(number(side, f"{where}: the size") for side in sides), where)
+        None
+        if None in sides
+        else image_size_of([number(side, f"{where}: the size") for side in sides], where)
     )
     return FileCamera(path.stem, size, K, dist, pose(R, place[:, 3]))

@@ -13,7 +13,7 @@ import numpy as np
 from poem_jax.calibration.assemble import Calibration, FileCamera, from_centres, pose, to_centres
 from poem_jax.calibration.camera_values import (
     entry,
-    image_size,
+    image_size_of,
     intrinsics,
     numbers,
     rotation,
@@ -88,4 +88,4 @@ def _camera(camera: dict[str, Any], index: int, path: Path) -> FileCamera:
     K = from_centres(intrinsics(entry(camera, "K", where), where))
     dist = lens_terms(camera.get("distCoef", []), f"{where}: `distCoef`")
     R, t = rotation(entry(camera, "R", where), where), translation(entry(camera, "t", where), where)
-    return FileCamera(name, image_size(*size, where), K, dist, pose(R, t))
+    return FileCamera(name, image_size_of(size, where), K, dist, pose(R, t))

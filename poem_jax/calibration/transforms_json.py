@@ -18,7 +18,7 @@ import numpy as np
 from poem_jax.calibration.assemble import Calibration, FileCamera, pose
 from poem_jax.calibration.camera_values import (
     entry,
-    image_size,
+    image_size_of,
     intrinsics,
     number,
     numbers,
@@ -97,8 +97,8 @@ def write_transforms(path: Path, rig: Rig) -> None:
 
 def _camera(values: Mapping[str, Any], name: str, path: Path) -> FileCamera:
     where = f"{path}: image '{name}'"
-    size = image_size(
-        *(number(entry(values, side, where), f"{where}: `{side}`") for side in ("w", "h")), where
+    size = image_size_of(
+        [number(entry(values, side, where), f"{where}: `{side}`") for side in ("w", "h")], where
     )
     matrix = numbers(entry(values, "transform_matrix", where), (4, 4), f"{where}: `transform_matrix`")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:

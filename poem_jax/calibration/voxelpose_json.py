@@ -16,7 +16,7 @@ import numpy as np
 from poem_jax.calibration.assemble import Calibration, FileCamera, from_centres, pose, to_centres
 from poem_jax.calibration.camera_values import (
     entry,
-    image_size,
+    image_size_of,
     intrinsics,
     number,
     numbers,
@@ -88,5 +88,5 @@ def _camera(camera: Mapping[str, Any], name: str, where: str) -> FileCamera:
     R = rotation(entry(camera, "R", where), where)
     centre = translation(entry(camera, "T", where), where)
     sides = [camera.get("width"), camera.get("height")]
-    size = None if None in sides else image_size(*sides, where)
+    size = None if None in sides else image_size_of(sides, where)
     return FileCamera(name, size, K, dist, pose(R, -R @ centre))

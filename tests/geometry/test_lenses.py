@@ -78,6 +78,7 @@ def test_a_rig_of_mixed_lenses_is_each_of_them(rng, x64):
     np.testing.assert_allclose(single, points, atol=3e-6)
 
 
+@pytest.mark.slow
 def test_gradients_equal_finite_differences(rng, check_gradients):
     """There and back at once, as each is the other's inverse, with another lens on the way back."""
     lenses = stack_lenses([FISHEYE, FOURTEEN])
