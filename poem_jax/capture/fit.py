@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from poem_jax.calibration.epipolar import ideal_keypoints
+from poem_jax.calibration.lens_reach import beyond_the_lens
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.frame import Frame, HandResult
@@ -87,7 +88,7 @@ def fit_hands(
         _HandFit(name, _keypoint_models(hands, side, offsets), config)
         for name, side in zip(take.hand_names, take.hand_sides, strict=True)
     ]
-    checked = said = False
+    checked = said = told = False
     for group, turns in _windows(frames, _CONTEXT if smooth else 0):
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
@@ -96,6 +97,10 @@ def fit_hands(
             checked = True
         warnings = [] if said else [str(finding) for finding in judge_views(take.rig, raw)]
         said = said or bool(warnings)
+        if not told:
+            lost = np.isfinite(raw).all(-1) & ~np.isfinite(keypoints).all(-1)
+            warnings += beyond_the_lens(take.rig, lost.sum((0, 1, 3)), "key points")
+            told = bool(lost.any())
         fitted = []
         for index, hand in enumerate(fits):
             fitted.append(hand.fit(keypoints[:, index], confidence[:, index], take.rig))
