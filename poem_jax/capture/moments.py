@@ -31,6 +31,8 @@ class Moments(NamedTuple):
     """None = only the order is known."""
     is_video: bool
     """Whether they lie in videos."""
+    sync: Path | None = None
+    """The file of offsets and rates, where there is one."""
 
     @property
     def follow_closely(self) -> bool:
@@ -38,8 +40,8 @@ class Moments(NamedTuple):
         return self.is_video and (self.frames_per_second or 0.0) >= _FOLLOWED_FROM
 
     def files(self) -> list[Path]:
-        """Return the files that hold the images, each once, in order."""
-        found: dict[Path, None] = {}
+        """Return the files that they are read from, each once."""
+        found: dict[Path, None] = {} if self.sync is None else {self.sync: None}
         for frame in [self.frames[0]] if self.is_video else self.frames:
             for image in frame.images:
                 if image is not None:
@@ -85,6 +87,13 @@ def find_moments(folder: str | os.PathLike, rig: Rig, timing: Timing = _WHOLE) -
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no capture folder at {folder}")
+    whole = _whole(folder, rig, timing)
+    sync = folder / SYNC_FILE
+    return _part(whole._replace(sync=sync if sync.is_file() else None), timing)
+
+
+def _whole(folder: Path, rig: Rig, timing: Timing) -> Moments:
+    """List all moments of a capture."""
     sync = read_sync(folder, rig.names)
     offsets_s = {**sync.offsets_s, **of_cameras(timing.offsets_s, rig.names, "--offsets")}
     videos = _video_files(folder)
@@ -96,13 +105,13 @@ def find_moments(folder: str | os.PathLike, rig: Rig, timing: Timing = _WHOLE) -
         found = match_cameras(videos, rig.names, "videos")
         _tell_missing(found, rig, "videos", folder)
         frames = VideoMoments(open_clips(found, rig.names, offsets_s, sync.frames_per_second), rig.num_views)
-        return _part(Moments(frames, frames.frames_per_second, True), timing)
+        return Moments(frames, frames.frames_per_second, True)
     rate = _one_rate(sync.frames_per_second, folder)
     if not (folder / "frames").is_dir() and not any(images_of_cameras(folder, rig.names)):
         found = find_camera_folders(folder, rig.names)
         if found:
             _tell_missing(found, rig, "folders of images", folder)
-            return _part(Moments(folder_moments(found, rig.names, offsets_s, rate), rate, False), timing)
+            return Moments(folder_moments(found, rig.names, offsets_s, rate), rate, False)
     if any(offsets_s.values()):
         raise ValueError(
             f"{folder} says itself which images are of one moment (frames/<frame>/<camera>.jpg): offsets are "
@@ -111,7 +120,7 @@ def find_moments(folder: str | os.PathLike, rig: Rig, timing: Timing = _WHOLE) -
     frames = find_frames(folder, rig.names)
     if rate is not None:
         frames = [frame._replace(time_s=index / rate) for index, frame in enumerate(frames)]
-    return _part(Moments(frames, rate, False), timing)
+    return Moments(frames, rate, False)
 
 
 def _video_files(folder: Path) -> list[Path]:
@@ -160,9 +169,8 @@ def _part(moments: Moments, timing: Timing) -> Moments:
     if len(rows) == count:
         return moments
     rate = moments.frames_per_second
-    return Moments(
-        PickedFrames(moments.frames, rows), None if rate is None else rate / timing.every, moments.is_video
-    )
+    rate = None if rate is None else rate / timing.every
+    return moments._replace(frames=PickedFrames(moments.frames, rows), frames_per_second=rate)
 
 
 def _index(place: Place, moments: Moments, option: str) -> int:

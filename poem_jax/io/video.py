@@ -215,8 +215,8 @@ class Video:
         if off and self._time_s >= 0 and not lost and not self._told_uneven:
             self._told_uneven = True
             _log.warning(
-                "%s: its frames are not evenly spaced (the rate varies, or frames are missing): the first so "
-                "is %.3f s after the one before, at %.3f s, instead of %.3f s. Each is taken by its time stamp",
+                "%s: its frames are not evenly spaced (the rate varies, or frames are missing): the first is "
+                "%.3f s after the one before, at %.3f s, instead of %.3f s. Time stamps tell which is used",
                 *(self.path, step_s, time_s, self._period_s),
             )
 
