@@ -69,8 +69,6 @@ class HandBoxes(NamedTuple):
     """What found the key points, None where the file does not say."""
     time_s: Float[Array, " frame"] | None = None
     """Seconds since the take began, None where the file gives none; NaN in frames that it does not name."""
-    search: str | None = None
-    """What was searched for them, and how (`search_file`); None where they come from elsewhere."""
 
 
 def read_boxes(path: str | os.PathLike) -> HandBoxes:
@@ -107,9 +105,8 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
     confidence = content.get("confidence") if keypoints is not None else None
     cameras = cameras_of_views(content, boxes.shape[2], path)
     times = times_of(content, len(boxes), path)
-    search = str(content["search"]) if "search" in content else None
     detector = detector_of(content, path)
-    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, detector, times, search)
+    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, detector, times)
 
 
 def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
@@ -127,8 +124,6 @@ def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
         content["detector"] = np.array(boxes.detector)
     if boxes.time_s is not None:
         content["time_s"] = boxes.time_s
-    if boxes.search is not None:
-        content["search"] = np.array(boxes.search)
     # A stream, since NumPy would add a suffix to a name that has none.
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **content)

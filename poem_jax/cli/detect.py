@@ -5,13 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from poem_jax.cli.messages import say, tells_what_is_left
 from poem_jax.cli.options import File, Flag, MomentOptions, Moments, OptionalFile, PositionalFolder
-
-if TYPE_CHECKING:
-    from poem_jax.capture.boxes_file import HandBoxes
 
 FOUND_FILE = "keypoints.npz"
 """What `reconstruct` and `fit` call the key points that they find."""
@@ -59,7 +55,7 @@ def where_hands_are(
         say(f"hands are where {given} says")
         return given
     found = out / FOUND_FILE
-    find_keypoints(folder, found, rig, max_hands, video, moments, again=False)
+    find_keypoints(folder, found, rig, max_hands, video, moments)
     return found
 
 
@@ -70,18 +66,19 @@ def find_keypoints(
     max_hands: int,
     video: bool,
     moments: Moments,
-    again: bool = True,
 ) -> None:
     """Write the key points of a capture to the file `out`, and print what was found.
 
-    What a search that was stopped found of the same images is taken up. Where `out` itself holds what the
-    same search found, nothing is done, unless `again`.
+    What was found in each image of a take stays beside it, so that nothing is searched twice: not after an
+    interruption, and not for a better calibration.
     """
+    import numpy as np
+
     from poem_jax.capture.boxes_file import write_boxes
     from poem_jax.capture.detect import describe_search, detect_hands
     from poem_jax.capture.detections import SearchFile
     from poem_jax.capture.moments import find_moments
-    from poem_jax.data.capture_folder import RIG_FILES, find_rig
+    from poem_jax.data.capture_folder import RIG_FILES, find_rig, hand_names
     from poem_jax.io.writable import check_inputs_stay
 
     if max_hands < 1:
@@ -97,12 +94,8 @@ def find_keypoints(
     kept = out.with_name(f"{out.stem}{SEARCH_SUFFIX}")
     check_inputs_stay([out, part, kept], [rig_file, *(folder / name for name in RIG_FILES), *take.files()])
     search = describe_search(take, rig, timing, max_hands=max_hands, video=video)
-    if not again and (before := _found_before(out, search, len(take.frames))) is not None:
-        say(f"hands are where {out} says: they were found before in the same images")
-        _print_hands(before)
-        return
-    file = SearchFile(kept, search)
-    if file.holds_another_search():
+    file = SearchFile(kept, search) if len(take.frames) > 1 else None
+    if file is not None and file.holds_another_search():
         say(f"{kept} is of other images or options: the search begins anew")
     say(f"looking for hands in {len(take.frames)} frames of {rig.num_views} cameras")
     with _tells_how_to_go_on(kept), tells_what_is_left(part):
@@ -114,10 +107,11 @@ def find_keypoints(
             file=file,
             when_stopped=partial(write_boxes, part),
         )
-        write_boxes(out, hands._replace(search=search))
+        write_boxes(out, hands)
     part.unlink(missing_ok=True)
-    kept.unlink(missing_ok=True)
-    _print_hands(hands)
+    views = np.isfinite(hands.boxes_px).all(-1).sum(2)
+    for name, count in zip(hand_names(hands.hand_side), views.T, strict=True):
+        print(f"{name} hand: seen by two views or more in {(count > 1).sum()} of {len(count)} frames")
 
 
 @contextlib.contextmanager
@@ -129,26 +123,3 @@ def _tells_how_to_go_on(kept: Path) -> Iterator[None]:
         if kept.is_file():
             say(f"the same command goes on from there: what was found in each image is in {kept}")
         raise
-
-
-def _found_before(out: Path, search: str, num_frames: int) -> "HandBoxes | None":
-    """Return what the file holds, if the same search found it; None otherwise, or where it cannot be read."""
-    from poem_jax.capture.boxes_file import read_boxes
-
-    if not out.is_file():
-        return None
-    try:
-        hands = read_boxes(out)
-    except ValueError:
-        return None
-    return hands if hands.search == search and len(hands.boxes_px) == num_frames else None
-
-
-def _print_hands(hands: "HandBoxes") -> None:
-    import numpy as np
-
-    from poem_jax.data.capture_folder import hand_names
-
-    views = np.isfinite(hands.boxes_px).all(-1).sum(2)
-    for name, count in zip(hand_names(hands.hand_side), views.T, strict=True):
-        print(f"{name} hand: seen by two views or more in {(count > 1).sum()} of {len(count)} frames")
