@@ -11,9 +11,9 @@ BLOCK = slice(4, 12)
 
 
 def picture(index, size_wh=(64, 48), seed=0):
-    """A smooth random picture with a square whose grey says the number, up to 30; BGR."""
+    """A smooth random picture that moves, with a square whose grey says the number, up to 30; BGR."""
     noise = np.random.default_rng(seed).integers(0, 255, (6, 8, 3)).astype(np.uint8)
-    image = cv2.resize(noise, size_wh, interpolation=cv2.INTER_CUBIC)
+    image = np.roll(cv2.resize(noise, size_wh, interpolation=cv2.INTER_CUBIC), index, axis=1)
     image[:16, :16] = LEVELS * index
     return image
 

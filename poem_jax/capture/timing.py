@@ -101,7 +101,8 @@ def read_sync(folder: str | os.PathLike, cameras: Sequence[str]) -> Sync:
         _check_number(value, f"{path}: `offsets_s` of {name}", -MAX_OFFSET_S, MAX_OFFSET_S)
     for name, value in rates.items():
         _check_number(value, f"{path}: `frames_per_second` of {name}", 1e-3, MAX_FRAMES_PER_SECOND)
-    return Sync(of_cameras(given, cameras, str(path)), of_cameras(rates, cameras, str(path)))
+    as_numbers = ({name: float(value) for name, value in part.items()} for part in (given, rates))
+    return Sync(*(of_cameras(part, cameras, str(path)) for part in as_numbers))
 
 
 def _check_number(value: Any, what: str, low: float, high: float) -> None:

