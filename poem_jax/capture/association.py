@@ -139,8 +139,8 @@ def _entries(
 ) -> tuple[Float[Array, "frame hand view 21 2"], Float[Array, "frame hand view"]]:
     """Return key points and scores of the chosen detections."""
     num_hands, num_frames, num_views = found.shape
-    keypoints = np.full((num_frames, num_hands, num_views, NUM_JOINTS, 2), np.nan, np.float32)
-    scores = np.full((num_frames, num_hands, num_views), np.nan, np.float32)
+    keypoints = np.full((num_frames, num_hands, num_views, NUM_JOINTS, 2), np.nan)
+    scores = np.full((num_frames, num_hands, num_views), np.nan)
     for frame, (views, sightings) in enumerate(zip(detections, frames, strict=True)):
         for hand, view in np.argwhere(found[:, frame] != NONE):
             chosen = views[view][sightings.number[found[hand, frame, view]]]
@@ -156,8 +156,8 @@ def _by_side_alone(
     called: Sequence[str],
 ) -> AssociatedHands:
     """Return the surest right and the surest left hand of every frame of the only camera that sees any."""
-    keypoints = np.full((len(detections), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan, np.float32)
-    scores = np.full(keypoints.shape[:3], np.nan, np.float32)
+    keypoints = np.full((len(detections), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
+    scores = np.full(keypoints.shape[:3], np.nan)
     left_out: list[int] = []
     for frame, views in enumerate(detections):
         for hand in sorted(views[view], key=lambda hand: abs(vote_for_right(hand)) + hand.score):

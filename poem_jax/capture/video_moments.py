@@ -16,6 +16,8 @@ from poem_jax.io.video import Video, VideoFrame
 MAX_RATIO = 10.0
 """Of the rates of two cameras: more, and one of the files names a wrong one."""
 _SAME_RATE = 0.005
+_WITHOUT_STAMPS = ".avi"
+"""Frames of this kind of file have the time that their number in the file gives."""
 _SLACK = 1e-3
 """Of a period, by which time stamps are rounded."""
 
@@ -115,6 +117,13 @@ def open_clips(
             _log.warning(
                 "%s is cut short: it ends at %.2f s, and says that it lasts until %.2f s",
                 *(video.path, video.header.last_s, video.header.said_last_s),
+            )
+        elif video.header.missing_frames and video.path.suffix.lower() == _WITHOUT_STAMPS:
+            _log.warning(
+                "%s has %d frames fewer than it says, and an AVI has no time stamps: if they are missing in "
+                "its middle, what follows is too early by as much. If this camera then disagrees with the "
+                "others, leave it out, or use the recording as it was before it was damaged",
+                *(video.path, video.header.missing_frames),
             )
     _tell_differences(clips)
     return clips

@@ -59,6 +59,11 @@ class VideoHeader(NamedTuple):
         """Whether the file ends earlier than it says, by more than such files are inexact."""
         return self.said_last_s - self.last_s > max(2.5 / self.frames_per_second, _INEXACT_S)
 
+    @property
+    def missing_frames(self) -> int:
+        """How many frames fewer there are than the file says."""
+        return max(round((self.said_last_s - self.last_s) * self.frames_per_second), 0)
+
 
 class Video:
     """The frames of a video file. One thread at a time reads; going back is slow, and works."""
@@ -101,7 +106,10 @@ class Video:
     def _open(self) -> None:
         if not self.path.is_file():
             raise FileNotFoundError(f"no video at {self.path}")
+        # OpenCV would add lines of its own to our error.
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        cv2.utils.logging.setLogLevel(level)
         if not self._capture.isOpened():
             raise ValueError(
                 f"{self.path} cannot be read as a video ({self.path.stat().st_size} bytes): it is of another "

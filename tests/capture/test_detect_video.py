@@ -154,13 +154,14 @@ def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeyp
 
 
 def test_a_damaged_frame_costs_its_view(search, folder, tmp_path, rig, caplog):
-    damage(folder / f"{rig.names[1]}.avi", size=8000)
+    (folder / "front.avi").unlink()
+    damage(write_video(folder / "front.mp4", FRAMES, size_wh=SIZE_WH, seed=1), size=6000)
     with caplog.at_level(logging.WARNING):
         assert search()[0] == 0
     found = numbers(tmp_path / "found.npz")
     np.testing.assert_array_equal(found[:, [0, 2]], np.tile(np.arange(FRAMES)[:, None], 2))
     lost = np.isnan(found[:, 1])
-    assert 1 <= lost.sum() <= 4
+    assert 1 <= lost.sum() <= 10
     assert (found[~lost, 1] == np.flatnonzero(~lost)).mean() > 0.9
     told = [record.getMessage() for record in caplog.records if "an image is left out" in record.getMessage()]
     assert len(told) == 1

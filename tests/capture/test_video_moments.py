@@ -13,7 +13,7 @@ from poem_jax.capture.moments import find_moments
 from poem_jax.capture.read import read_images
 from poem_jax.capture.take import read_keypoint_take, read_take
 from poem_jax.capture.timing import Timing, parse_timing
-from tests.videos import cut, number_of, picture, write_video
+from tests.videos import cut, damage, number_of, picture, write_video
 
 CAMERAS = ("left_cam", "front", "cam 3")
 
@@ -110,6 +110,14 @@ def test_a_video_that_is_cut_short_is_told(videos, rig, caplog):
     assert 8 < len(moments.frames) < 15
     assert "front.avi is cut short: it ends at" in caplog.text
     assert "and says that it lasts until 1.90 s" in caplog.text
+
+
+def test_an_avi_that_lacks_frames_is_told(videos, rig, caplog):
+    """Its frames are counted, and what follows the gap gets the time of an earlier one."""
+    folder = videos(front={"num_frames": 30}, left_cam={"num_frames": 30}, cam_3={"num_frames": 30})
+    damage(folder / "front.avi", size=2000)
+    find_moments(folder, rig)
+    assert "front.avi has 2 frames fewer than it says" in caplog.text
 
 
 def test_part_of_a_take(videos, rig):
