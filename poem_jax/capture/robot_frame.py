@@ -1,8 +1,8 @@
 """The frame in which programs that steer robot hands expect a human hand's joints.
 
-x out of the palm, z from the wrist to the middle knuckle, y completes them: towards the thumb's side on a right
-hand, away from it on a left one. The origin is the wrist. So do dex-retargeting's examples feed it, and so
-stand Allegro hands.
+x out of the palm, z from the wrist to the middle knuckle, y completes them: towards the thumb's side on a
+right hand, away from it on a left one. The origin is the wrist. So do dex-retargeting's examples feed it, and
+so stand Allegro hands.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Joint angles of a robot hand whose finger tips follow a reconstructed hand, by dex-retargeting (an extra).
 
 dex-retargeting looks for the angles that bring vectors between links of the robot nearest to those between
-joints of the person, scaled (Qin et al., AnyTeleop, 2023). The vectors taken here run from the middle knuckle to
-the tips; the scale makes the person's fingers as long as the robot's.
+joints of the person, scaled (Qin et al., AnyTeleop, 2023). The vectors taken here run from the middle knuckle
+to the tips; the scale makes the person's fingers as long as the robot's.
 """
 
 from pathlib import Path

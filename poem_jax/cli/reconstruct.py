@@ -56,9 +56,9 @@ class Reconstruct:
     meshes: Flag = False
     """Write the meshes of every frame of a take too, not only its animation."""
     formats: Formats = "glb"
-    """What to write besides arrays, page, report and overlays, with commas between: glb (animation of a take),
-    bvh (skeletons), csv (joints and angles), trc (markers), mano (parameters); video or png: overlays as such,
-    else as images of a take of up to 20 frames, and as videos of a longer one."""
+    """What to write besides arrays, page, report and overlays, with commas between: glb (animation of a
+    take), bvh (skeletons), csv (joints and angles), trc (markers), mano (parameters); video or png: overlays
+    as such, else as images of a take of up to 20 frames, and as videos of a longer one."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
@@ -83,9 +83,7 @@ class Reconstruct:
         boxes = self.boxes or where_hands_are(self.folder, self.out, self.rig, self.max_hands, self.video)
         with tells_what_is_left(self.out):
             written = (
-                self._fit(boxes, hand, formats)
-                if self.engine == "fit"
-                else self._reconstruct(boxes, formats)
+                self._fit(boxes, hand, formats) if self.engine == "fit" else self._reconstruct(boxes, formats)
             )
         print_files(written, self.out)
         print_summary(written.report)

@@ -20,7 +20,7 @@ from poem_jax.typing import Array, Float, array_namespace
 
 _SKELETON = np.array(SKELETON_FROM_OPENPOSE, np.int32)
 _BONES = np.array(BONES)
-_LENGTH_SIGMA_M = 0.002
+_LENGTH_SIGMA_M = 0.001
 """How far a bone's length may be off; shape coefficients are about N(0, 1) beside it."""
 _ITERATIONS = 8
 
@@ -69,12 +69,10 @@ def rotations_of_joints(
     return bone_rotations(fit.R, rest, joints)
 
 
-def shape_of_bones(
-    hand: HandModel, lengths_m: Float[Array, "20"]
-) -> Float[np.ndarray, "10"]:
+def shape_of_bones(hand: HandModel, lengths_m: Float[Array, "20"]) -> Float[np.ndarray, "10"]:
     """Return the shape coefficients whose 20 bones (`topology.BONES`) come nearest to given lengths.
 
-    Gauss-Newton on the lengths, each off by 2 mm, with N(0, 1) for the coefficients.
+    Gauss-Newton on the lengths, each off by 1 mm, with N(0, 1) for the coefficients.
     """
     zero, each = np.zeros(NUM_SHAPES), np.eye(NUM_SHAPES)
     mean = _bones(hand, zero)

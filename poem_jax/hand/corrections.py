@@ -14,6 +14,8 @@ from poem_jax.typing import Array, Float
 
 _TOLERANCE_M = 3e-5
 """What is left out of the correction, root sum of squares over the hand's vertices, in the worst frame."""
+_NO_DIRECTION = 1e-12
+"""Share of the largest squared strength below which a direction is taken for rounding."""
 
 
 class Corrections(NamedTuple):
@@ -35,14 +37,15 @@ def few_corrections(hand: HandModel, rotations: Float[Array, "frame 16 3 3"]) ->
     """
     features = np.asarray(rotations, np.float64)[:, 1:] - np.eye(3)
     directions = np.asarray(hand.posedirs, np.float64).reshape(-1, NUM_POSE_FEATURES)
-    basis, strength, turn = np.linalg.svd(directions, full_matrices=False)
-    # Along an orthonormal basis, so that lengths are lengths of offsets.
-    along = features.reshape(len(features), -1) @ (turn.T * strength)
+    # Along an orthonormal basis of all offsets, directions @ turn / strength, so that lengths are theirs.
+    squares, turn = np.linalg.eigh(directions.T @ directions)
+    strength = np.sqrt(np.maximum(squares, _NO_DIRECTION * squares[-1]))
+    along = features.reshape(len(features), -1) @ (turn * strength)
     _, principal = np.linalg.eigh(along.T @ along)
     principal = principal[:, ::-1]
     mixed = along @ principal
     left_out = np.sqrt(np.cumsum(mixed[:, ::-1] ** 2, axis=1)[:, ::-1]).max(0)
     count = int((left_out > _TOLERANCE_M).sum())
     largest = np.abs(mixed[:, :count]).max(0)
-    targets = (basis @ (principal[:, :count] * largest)).T
+    targets = (directions @ (turn / strength) @ (principal[:, :count] * largest)).T
     return Corrections(targets.reshape(count, NUM_VERTICES, 3), mixed[:, :count] / largest)

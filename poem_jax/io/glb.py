@@ -9,7 +9,7 @@ import struct
 import tempfile
 from pathlib import Path
 from shutil import copyfileobj
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class Glb:
         self.size = 0
         """Bytes of numbers so far."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Glb":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -56,15 +56,14 @@ def _add_piece(
     frames: Int[Array, " n"],
     time_s: Array,
 ) -> int:
-    base = np.asarray(vertices_of(frames[0]), np.float32)
+    first, *others = frames.tolist()
+    base = np.asarray(vertices_of(first), np.float32)
     primitive = {
         "attributes": {"POSITION": glb.store(base, VERTEX_TARGET)},
         "indices": look[0],
         "material": look[1],
     }
-    later = [
-        glb.store(np.asarray(vertices_of(frame), np.float32) - base, VERTEX_TARGET) for frame in frames[1:]
-    ]
+    later = [glb.store(np.asarray(vertices_of(frame), np.float32) - base, VERTEX_TARGET) for frame in others]
     if later:
         primitive["targets"] = [{"POSITION": target} for target in later]
     there = np.zeros(len(time_s), bool)

@@ -1,9 +1,10 @@
 """A mesh that follows a skeleton, in a glTF scene: linear blend skinning with corrections of the pose.
 
 glTF 2.0 (Khronos, 2021, 3.7.3): a vertex v of the rest mesh, moved by its weighted morph targets, goes to
-sum_j w_j G_j B_j v, G_j = transform of joint node j in the scene, B_j = inverse of its place at rest. All joints
-rest unturned here, so B_j is a translation. Four joints may pull at a vertex, as viewers support no more. The
-place of the node that holds the mesh does not count; it stands at the scene's root, as the standard advises.
+sum_j w_j G_j B_j v, G_j = transform of joint node j in the scene, B_j = inverse of its place at rest. All
+joints rest unturned here, so B_j is a translation. Four joints may pull at a vertex, as viewers support no
+more. The place of the node that holds the mesh does not count; it stands at the scene's root, as the standard
+advises.
 """
 
 from typing import NamedTuple

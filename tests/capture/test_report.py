@@ -69,7 +69,9 @@ def test_the_whole_report(report, tmp_path):
 
 def test_times_bridged_frames_and_uncertainty(report, tmp_path):
     for index, (time_s, bridged) in enumerate([(0.0, False), (0.04, True), (0.08, False), (0.5, False)]):
-        hand = found(1.0, 2.0, np.nan)._replace(joint_sigma_m=np.full(21, 0.001 + index / 1000), bridged=bridged)
+        hand = found(1.0, 2.0, np.nan)._replace(
+            joint_sigma_m=np.full(21, 0.001 + index / 1000), bridged=bridged
+        )
         report.add(frame(str(index), hand)._replace(time_s=time_s))
     content = json.loads(report.write({}, {}).read_text())
     assert content["frames_per_second"] == pytest.approx(25)

@@ -1,5 +1,6 @@
 """A reader of GLB files that knows the standard and nothing of the writer: what is to be seen at a time."""
 
+import functools
 import json
 import struct
 
@@ -20,7 +21,9 @@ class Gltf:
         assert size % 4 == 0
         self.content = json.loads(data[20 : 20 + size])
         self.nodes = self.content["nodes"]
-        self.parents = {child: node for node, item in enumerate(self.nodes) for child in item.get("children", [])}
+        self.parents = {
+            child: node for node, item in enumerate(self.nodes) for child in item.get("children", [])
+        }
         self.binary = b""
         if "buffers" in self.content:
             binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
@@ -33,6 +36,7 @@ class Gltf:
                 target = channel["target"]
                 self.curves[target["node"], target["path"]] = animation["samplers"][channel["sampler"]]
 
+    @functools.cache  # noqa: B019
     def array(self, index):
         accessor = self.content["accessors"][index]
         view = self.content["bufferViews"][accessor["bufferView"]]
@@ -57,6 +61,7 @@ class Gltf:
             return Slerp(times, Rotation.from_quat(values))(np.clip(time, times[0], times[-1])).as_quat()
         return np.array([np.interp(time, times, column) for column in values.T])
 
+    @functools.cache  # noqa: B019
     def world(self, node, time):
         """4x4 transform of a node in the scene."""
         own = np.eye(4)
@@ -79,7 +84,7 @@ class Gltf:
             else:
                 world = self.world(index, time)
                 points = points @ world[:3, :3].T + world[:3, 3]
-            if np.ptp(points, axis=0).max() > 0:
+            if np.ptp(points, axis=0).max() > 1e-6:
                 assert node["name"] not in shown, "one piece at a time"
                 shown[node["name"]] = points, self.array(primitive["indices"]).reshape(-1, 3)
         return shown

@@ -1,4 +1,4 @@
-"""BVH, read again by a reader that follows the keywords of the file, and by one from PyPI where it is there."""
+"""BVH, read again by a reader that follows the keywords of the file, and by one from PyPI."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from poem_jax.io.bvh import BvhSkeleton, write_bvh
 
 
 def read_bvh(path):
-    """Return names, parents, offsets, ends, (frame, joint, 4, 4) transforms in the world and the frame time."""
+    """Return names, parents, ends, transforms in the world (frame, joint, 4, 4) and the frame time."""
     words = path.read_text().split()
     names, parents, offsets, channels, ends, open_joints = [], [], [], [], {}, []
     place = words.index("HIERARCHY") + 1
@@ -49,7 +49,7 @@ def read_bvh(path):
             if kind.endswith("position"):
                 turn[:, "XYZ".index(kind[0]), 3] = values
             else:
-                turn[:, :3, :3] = Rotation.from_euler(kind[0], values, degrees=True).as_matrix()
+                turn[:, :3, :3] = Rotation.from_euler(kind[0], values[:, None], degrees=True).as_matrix()
             own, column = own @ turn, column + 1
         world[:, joint] = own if parent < 0 else world[:, parent] @ own
     assert column == numbers.shape[1]
@@ -61,7 +61,10 @@ def planted(frames=7, joints=5):
     rotations = Rotation.random(frames * joints, rng=rng).as_matrix().reshape(frames, joints, 3, 3)
     # The order of a file is depth first: joint 2 comes after 3 and 4 there.
     skeleton = BvhSkeleton(
-        [f"joint_{i}" for i in range(joints)], (-1, 0, 0, 1, 3), rng.normal(size=(joints, 3)), {4: np.ones(3), 2: -np.ones(3)}
+        [f"joint_{i}" for i in range(joints)],
+        (-1, 0, 0, 1, 3),
+        rng.normal(size=(joints, 3)),
+        {4: np.ones(3), 2: -np.ones(3)},
     )
     return skeleton, rng.normal(size=(frames, 3)), rotations
 
@@ -83,7 +86,9 @@ def test_a_reader_finds_every_joint_where_it_was(tmp_path):
     names, parents, ends, world, step = read_bvh(tmp_path / "hand.bvh")
     order = [skeleton.names.index(name) for name in names]
     assert order == [0, 1, 3, 4, 2]
-    assert [order[parent] if parent >= 0 else -1 for parent in parents] == [skeleton.parents[j] for j in order]
+    assert [order[parent] if parent >= 0 else -1 for parent in parents] == [
+        skeleton.parents[j] for j in order
+    ]
     np.testing.assert_allclose(world, forward(skeleton, root, rotations)[:, order], atol=5e-6)
     assert ends.keys() == {"joint_4", "joint_2"}
     assert step == pytest.approx(1 / 30, abs=1e-9)
@@ -114,5 +119,5 @@ def test_angles_do_not_jump_by_full_turns(tmp_path):
     degrees = np.arange(0.0, 720, 20)[:, None]
     turns = Rotation.from_euler("Z", degrees, degrees=True).as_matrix()[:, None]
     write_bvh(tmp_path / "hand.bvh", skeleton, np.zeros((len(turns), 3)), turns, 0.1)
-    rows = np.loadtxt(tmp_path / "hand.bvh", skiprows=11)
+    rows = np.loadtxt(tmp_path / "hand.bvh", skiprows=13)
     np.testing.assert_allclose(rows[:, 3], degrees[:, 0], atol=1e-5)

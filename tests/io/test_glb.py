@@ -98,7 +98,9 @@ def test_a_skinned_mesh_goes_where_its_joints_carry_it(tmp_path):
     wxyz = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat()[:, [3, 0, 1, 2]].reshape(5, 4, 4)
     root, mix = rng.normal(size=(5, 3)), rng.normal(size=(5, 2))
     with Glb() as glb:
-        mesh, first = add_skinned_mesh(glb, "right", (1, 2, 3), skin, SkinMotion(time_s, seen, wxyz, root, mix))
+        mesh, first = add_skinned_mesh(
+            glb, "right", (1, 2, 3), skin, SkinMotion(time_s, seen, wxyz, root, mix)
+        )
         glb.roots += [mesh, first]
         glb.write(tmp_path / "hands.glb")
     gltf = Gltf(tmp_path / "hands.glb")

@@ -47,8 +47,7 @@ def write_animation(
     with Glb() as glb:
         upright = quaternion_from_rotation(motion.R_upright_from_world)[[1, 2, 3, 0]].tolist()
         below: list[int] = []
-        place = motion.upright(np.zeros(3)).tolist()
-        capture = glb.node(name="capture", rotation=upright, translation=place)
+        capture = glb.node(name="capture", rotation=upright)
         glb.roots.append(capture)
         for index, hand in enumerate(motion.hands):
 
@@ -92,7 +91,7 @@ def _skin_error_m(hand: HandMotion, vertices_of: Callable[[int], Array]) -> floa
         return None
     frames = np.flatnonzero(hand.seen)
     frames = frames[np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES_COMPARED)).astype(int)]
-    offsets = [hand.skeleton.vertices(frame) - vertices_of(frame) for frame in frames]
+    offsets = [hand.skeleton.vertices(frame) - vertices_of(frame) for frame in frames.tolist()]
     return float(np.mean([np.linalg.norm(offset, axis=-1).mean() for offset in offsets]))
 
 

@@ -1,9 +1,11 @@
-"""The files for other programs, written once all frames are known: animation, skeletons, tables, parameters."""
+"""The files for other programs, written once all frames are known."""
 
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from poem_jax.capture.outputs.animation import write_animation
 from poem_jax.capture.outputs.formats import Format
@@ -72,6 +74,8 @@ def write_exports(
     motion = take_motion(
         prediction.names, take.hand_names, take.hand_sides, prediction.array, hands, origin_world, upright
     )
+    if origin_world.any():
+        about["origin_world_m"] = np.asarray(origin_world, float).tolist()
     if hands is None and formats & set(_NEED_A_MODEL):
         _log.warning("no hand model is known: %s is not written", " and ".join(_NEED_A_MODEL))
     if Format.GLB in formats:

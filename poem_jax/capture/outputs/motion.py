@@ -1,4 +1,4 @@
-"""How the hands of a take move: one shape and the turns of 16 joints per hand, for files of animation programs.
+"""How the hands of a take move: one shape and the turns of 16 joints per hand.
 
 An engine that fits a hand model gives the turns. Of one that gives meshes and joints alone, the shape is
 found from the lengths of the bones, and the turns from their directions (`hand/bones.py`).
@@ -71,13 +71,14 @@ class TakeMotion(NamedTuple):
     """Increasing."""
     hands: list[HandMotion]
     origin_world: Float[Array, "3"]
-    """Where points of the motion are measured from, in the capture's world."""
+    """Where points of the motion are measured from, in the capture's world: its own origin, or where that is
+    far away a point amidst the cameras, since programs that show animations compute in float32."""
     R_upright_from_world: Float[Array, "3 3"]
     """To axes of which y is up, for files that expect it."""
 
     def upright(self, points: Float[Array, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Return points of the motion with the capture's origin and y up."""
-        flat = np.reshape(points + self.origin_world, (-1, 3))
+        """Return points of the motion, from its origin, in axes of which y is up."""
+        flat = np.reshape(points, (-1, 3)).astype(np.float64)
         return rotate_points(self.R_upright_from_world, flat).reshape(np.shape(points))
 
 

@@ -1,4 +1,4 @@
-"""The meshes drawn over the photographs: `<frame>/overlay_<camera>.png`, or `overlay_<camera>.mp4` of a take."""
+"""The meshes drawn over the photographs: one PNG a frame and camera, or one video a camera."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -31,9 +31,9 @@ class Drawn(NamedTuple):
 
 def draw_views(
     frame: Frame, rig: Rig, vertices: Mapping[str, Float[Array, "778 3"]], hands: Mapping[str, Drawn]
-) -> list[UInt8[Array, "h w 3"] | None]:
-    """Return each photograph of a frame with its meshes (by the hands' names) drawn on it, None = no image."""
-    drawn: list[UInt8[Array, "h w 3"] | None] = []
+) -> list[UInt8[Array, "_ _ 3"] | None]:
+    """Return each photograph of a frame with its meshes, by the hands' names, on it; None = no image."""
+    drawn: list[UInt8[Array, "_ _ 3"] | None] = []
     for view, image in enumerate(frame.images):
         if image is None:
             drawn.append(None)
@@ -66,11 +66,11 @@ class OverlayVideos:
             paths: One per camera, ending in `.mp4`.
         """
         self._videos = [_Video(path) for path in paths]
-        self._waiting: list[UInt8[Array, "h w 3"] | None] | None = None
+        self._waiting: list[UInt8[Array, "_ _ 3"] | None] | None = None
         self._first_s: float | None = None
         self._rate: float | None = None
 
-    def add(self, time_s: float | None, images: Sequence[UInt8[Array, "h w 3"] | None]) -> None:
+    def add(self, time_s: float | None, images: Sequence[UInt8[Array, "_ _ 3"] | None]) -> None:
         """Append a frame; a camera without an image is grey in it.
 
         The rate is that of the first two frames, by their times in seconds, or 30 a second.
@@ -105,7 +105,7 @@ class OverlayVideos:
         self._append(self._waiting)
         self._waiting = None
 
-    def _append(self, images: Sequence[UInt8[Array, "h w 3"] | None]) -> None:
+    def _append(self, images: Sequence[UInt8[Array, "_ _ 3"] | None]) -> None:
         assert self._rate is not None
         for video, image in zip(self._videos, images, strict=True):
             video.append(image, self._rate)
@@ -138,7 +138,8 @@ class _Video:
         found = _frames_in(self._temporary)
         if found != self._count:
             raise OSError(
-                f"{self._path} cannot be written: {found} of its {self._count} frames arrived; is the disk full?"
+                f"{self._path} cannot be written: {found} of its {self._count} frames arrived; "
+                "is the disk full?"
             )
         self._file.close()
         self._writer = None
@@ -158,7 +159,8 @@ class _Video:
         self._writer = cv2.VideoWriter(os.fspath(self._temporary), codec, rate, (width, height))
         if not self._writer.isOpened():
             raise OSError(
-                f"{self._path} cannot be written: OpenCV opens no {_CODEC} video there; --formats png writes images"
+                f"{self._path} cannot be written: OpenCV opens no {_CODEC} video there; "
+                "--formats png writes images"
             )
         self._grey = np.full_like(image, 128)
         for _ in range(self._count):

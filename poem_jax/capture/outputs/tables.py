@@ -45,10 +45,8 @@ def _angles(hand: HandMotion) -> Float[Array, "frame 15 3"]:
     return np.where(hand.seen[:, None, None], angles, np.nan)
 
 
-def _write(
-    path: Path, take: TakeMotion, columns: Sequence[str], values: Sequence[Array], how: str
-) -> Path:
-    """Write a table: frame, time, and per hand whether it is there, whether it is bridged, and its columns."""
+def _write(path: Path, take: TakeMotion, columns: Sequence[str], values: Sequence[Array], how: str) -> Path:
+    """Write frame, time, and per hand whether it is there, whether it is bridged, and its columns."""
     head = ["frame", "time_s"]
     for hand in take.hands:
         head += [f"{hand.name}_{column}" for column in ("valid", "bridged", *columns)]

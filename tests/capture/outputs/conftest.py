@@ -62,7 +62,10 @@ def planted_take(count=9, *, pose=True, uneven=False, far=False):
     shape, spots = rng.normal(size=(2, 10)), rng.uniform(-0.1, 0.1, (count, 2, 3))
     seen = np.ones((count, 2), bool)
     seen[:2, 1] = seen[5, 1] = False
-    meshes = [hand_mesh(HANDS[s], poses[:, i], np.tile(shape[i], (count, 1)), spots[:, i]) for i, s in enumerate(SIDES)]
+    meshes = [
+        hand_mesh(HANDS[s], poses[:, i], np.tile(shape[i], (count, 1)), spots[:, i])
+        for i, s in enumerate(SIDES)
+    ]
     frames = []
     for index in range(count):
         results = []
@@ -85,7 +88,15 @@ def planted_take(count=9, *, pose=True, uneven=False, far=False):
                 )
             results.append(result)
         boxes = np.full((2, 3, 4), 1.0)
-        frames.append(Frame(f"{index:04d}", boxes, hands=tuple(results), time_s=float(time_s[index])))
+        frames.append(
+            Frame(
+                f"{index:04d}",
+                boxes,
+                images=(None,) * 3,
+                hands=tuple(results),
+                time_s=float(time_s[index]),
+            )
+        )
     vertices = np.stack([mesh.vertices for mesh in meshes], 1)
     joints = np.stack([mesh.joints for mesh in meshes], 1)
     origin = FAR if far else np.zeros(3)

@@ -37,7 +37,15 @@ def test_what_is_chosen_is_written(planted, tmp_path):
     take = planted()
     assert run(take, tmp_path / "a", DEFAULT_FORMATS) == always | {"hands.glb"}
     assert run(take, tmp_path / "b", frozenset({Format.TRC})) == always | {"hands.trc"}
-    all_names = {"hands.glb", "right.bvh", "left.bvh", "joints.csv", "joint_angles.csv", "hands.trc", "mano.npz"}
+    all_names = {
+        "hands.glb",
+        "right.bvh",
+        "left.bvh",
+        "joints.csv",
+        "joint_angles.csv",
+        "hands.trc",
+        "mano.npz",
+    }
     assert run(take, tmp_path / "c", frozenset(Format)) == always | all_names
     report = json.loads((tmp_path / "c" / "report.json").read_text())
     assert report["animation"]["right"]["moves_by"] == "skeleton"
@@ -45,7 +53,8 @@ def test_what_is_chosen_is_written(planted, tmp_path):
     assert report["frames_per_second"] == pytest.approx(25)
 
 
-def test_overlays_of_a_long_take_are_videos(planted, tmp_path):
+def test_overlays_of_a_long_take_are_videos(planted, tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "draw_views", lambda frame, *_: frame.images)
     one = {"0003/overlay_front.png"}
     short = run(planted(), tmp_path / "a", DEFAULT_FORMATS, pictures=True)
     assert one <= short

@@ -12,7 +12,9 @@ from tests.capture.outputs.conftest import HANDS
 @pytest.mark.parametrize("far", [False, True])
 def test_the_meshes_come_back(planted, tmp_path, far):
     take = planted(far=far)
-    given = {side: hand._replace(v_template=hand.v_template * np.float32(1.0001)) for side, hand in HANDS.items()}
+    given = {
+        side: hand._replace(v_template=hand.v_template * np.float32(1.0001)) for side, hand in HANDS.items()
+    }
     write_mano(tmp_path / "mano.npz", take.motion(tmp_path / "a.npz"), given)
     with np.load(tmp_path / "mano.npz") as stored:
         values = dict(stored)

@@ -40,7 +40,8 @@ def test_every_frame_is_at_its_place(tmp_path):
     for index in range(6):
         expected = [128] * 3 if index in (0, 3) else [40 * index, 60, 255 - 40 * index]
         np.testing.assert_allclose(levels[index], expected, atol=12)
-    assert {frame.shape for frame in read(paths[1])[1]} == {(*SIZES[1], 3)}
+    # The encoder wants even sizes, and OpenCV cuts off the odd row and column.
+    assert {frame.shape for frame in read(paths[1])[1]} == {(44, 60, 3)}
     assert len(read(paths[1])[1]) == 6
 
 

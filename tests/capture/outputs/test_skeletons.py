@@ -55,5 +55,7 @@ def test_uneven_times_are_drawn_anew(planted, tmp_path):
     expected = motion.upright(take.joints[:, 0, 0])
     times = np.minimum(take.time_s[0] + step * np.arange(len(wrist)), take.time_s[-1])
     for axis in range(3):
-        np.testing.assert_allclose(wrist[:, axis], np.interp(times, take.time_s, expected[:, axis]), atol=1e-5)
+        np.testing.assert_allclose(
+            wrist[:, axis], np.interp(times, take.time_s, expected[:, axis]), atol=1e-5
+        )
     assert times[-1] == pytest.approx(take.time_s[-1], abs=step)

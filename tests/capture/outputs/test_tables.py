@@ -57,7 +57,9 @@ def test_a_bent_finger_has_a_positive_flexion_on_either_hand(planted, tmp_path):
             pose[2] = np.deg2rad(60) * anatomical_axes(HANDS[side])[1, 0]
             hands.append(hand._replace(pose=None if hand.pose is None else pose))
         frames.append(frame._replace(hands=tuple(hands)))
-    rows = read(write_angles(tmp_path / "angles.csv", take._replace(frames=frames).motion(tmp_path / "a.npz")))
+    rows = read(
+        write_angles(tmp_path / "angles.csv", take._replace(frames=frames).motion(tmp_path / "a.npz"))
+    )
     for name in ("right", "left"):
         assert float(rows[3][f"{name}_index_pip_flexion_deg"]) == pytest.approx(60, abs=0.01)
 
