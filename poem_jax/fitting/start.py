@@ -14,7 +14,7 @@ from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, trans
 from poem_jax.hand.bones import bone_rotations
 from poem_jax.hand.joint_limits import anatomical_angles
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, PALM_JOINTS, WRIST
-from poem_jax.typing import Bool, Float
+from poem_jax.typing import Array, Bool, Float
 
 MIN_JOINTS = 3
 """Joints that a frame must have triangulated to be fitted."""
