@@ -28,7 +28,7 @@ from poem_jax.geometry.cameras import (
 from poem_jax.geometry.distortion import distort
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
-from poem_jax.hand.model import mirror_pose
+from poem_jax.hand.model import HandModel, mirror, mirror_pose
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
@@ -55,6 +55,14 @@ class Network(NamedTuple):
         """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
         right = np.asarray(self.prepared.params["constants"]["hand"]["faces"])
         return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
+
+    def hands(self) -> dict[str, HandModel] | None:
+        """Return the model's hand and its mirror image by side, None where it has triangles alone."""
+        fields = self.prepared.params["constants"]["hand"]
+        if not set(HandModel._fields) <= set(fields):
+            return None
+        right = HandModel(*(np.asarray(fields[name]) for name in HandModel._fields))
+        return {"right": right, "left": HandModel(*(np.asarray(field) for field in mirror(right)))}
 
 
 def load_network(checkpoint: str | os.PathLike | None) -> Network:

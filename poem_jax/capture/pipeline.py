@@ -19,6 +19,7 @@ from poem_jax.capture.fit import Hands, fit_hands, hands_of
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network, load_network, predict_hands
+from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
 from poem_jax.capture.read import read_images
 from poem_jax.capture.report import Clock
 from poem_jax.capture.take import Take
@@ -39,6 +40,7 @@ def reconstruct(
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
     meshes: bool | None = None,
+    formats: frozenset[Format] = DEFAULT_FORMATS,
     progress: bool = True,
 ) -> Written:
     """Reconstruct every hand of every frame by a network, and write what comes of it under `out`.
@@ -49,6 +51,7 @@ def reconstruct(
         checkpoint: Model folder; None = the shipped weights. Not read when a network is given.
         network: A model in memory.
         meshes: Write the meshes of every frame; None = if there is only one.
+        formats: What to write beyond arrays, page, report and overlays.
         progress: Show a progress bar when there are several frames.
 
     Raises:
@@ -62,7 +65,8 @@ def reconstruct(
     clock.lap("load_model")
     engine = functools.partial(by_network, network=network)
     about = {"engine": "network", "weights": network.origin, "image_hw": network.config.image_hw}
-    return _run(take, Path(out), engine, network.faces(), clock, about, meshes, progress)
+    faces, sides = network.faces(), network.hands()
+    return _run(take, Path(out), engine, faces, clock, about, meshes, progress, sides, formats)
 
 
 def fit(
@@ -73,6 +77,7 @@ def fit(
     smooth: bool = False,
     detector: str | None = None,
     meshes: bool | None = None,
+    formats: frozenset[Format] = DEFAULT_FORMATS,
     progress: bool = True,
 ) -> Written:
     """Fit every hand of a take to its key points, and write what `reconstruct` writes, under `out`.
@@ -87,6 +92,7 @@ def fit(
         smooth: Add a second pass that holds each hand's frames together.
         detector: What found the key points, as for `fit_hands`; None = as their file names it.
         meshes: Write the meshes of every frame; None = if there is only one.
+        formats: What to write beyond arrays, page, report and overlays.
         progress: Show a progress bar when there are several frames.
 
     Raises:
@@ -103,7 +109,8 @@ def fit(
     about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
     about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
-    return _run(take, Path(out), engine, faces, clock, about, meshes, progress)
+    sides = {"right": hands.right, "left": hands.left}
+    return _run(take, Path(out), engine, faces, clock, about, meshes, progress, sides, formats)
 
 
 def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Network) -> Iterator[Frame]:
@@ -132,6 +139,8 @@ def _run(
     about: Mapping[str, Any],
     meshes: bool | None,
     progress: bool,
+    hands: Mapping[str, HandModel] | None,
+    formats: frozenset[Format],
 ) -> Written:
     """Run the line, in a world whose origin is near the cameras."""
     single = take.num_frames == 1
@@ -141,5 +150,6 @@ def _run(
     frames = engine(take.frames, take, clock)
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
-    style = Style(faces, single if meshes is None else meshes, not single, origin_world)
+    meshes = single if meshes is None else meshes
+    style = Style(faces, meshes, not single, origin_world, hands, formats)
     return write_results(frames, take, out, style, clock, about)

@@ -8,7 +8,16 @@ import tyro
 
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Detector, Flag, Folder, MomentOptions, Moments, OptionalFile, OptionalFolder
+from poem_jax.cli.options import (
+    Detector,
+    Flag,
+    Folder,
+    Formats,
+    MomentOptions,
+    Moments,
+    OptionalFile,
+    OptionalFolder,
+)
 
 if TYPE_CHECKING:
     from poem_jax.hand.model import HandModel
@@ -46,16 +55,20 @@ class Fit:
     none: nothing known, they are the joints and finger tips."""
     meshes: Flag = False
     """Write the meshes of every frame of a take too, not only its animation."""
+    formats: Formats = "glb"
+    """As for `poem reconstruct`."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
     def run(self) -> None:
         """Write the results and print where they are."""
+        from poem_jax.capture.outputs.formats import formats_of
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_keypoint_take
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
+        formats = formats_of(self.formats)
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
         hand = hand_from(self.mano)
@@ -72,9 +85,15 @@ class Fit:
         take = read_keypoint_take(keypoints, self.rig, images, self.moments.timing())
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):
-            meshes = self.meshes or None
-            detector = named_detector(self.detector)
-            written = fit(take, self.out, hand=hand, smooth=self.smooth, detector=detector, meshes=meshes)
+            written = fit(
+                take,
+                self.out,
+                hand=hand,
+                smooth=self.smooth,
+                detector=named_detector(self.detector),
+                meshes=self.meshes or None,
+                formats=formats,
+            )
         print_files(written, self.out)
         print_summary(written.report)
 

@@ -18,6 +18,8 @@ Detector = Literal["file", "mediapipe-hands", "none"]
 """What found key points: "file" = as their file names it, "none" = take them to be the hand model's."""
 PositionalFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 Experiment = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
+Formats = Annotated[str, tyro.conf.arg(metavar="NAMES")]
+"""What `capture.outputs.formats` reads."""
 
 
 @dataclass(frozen=True)

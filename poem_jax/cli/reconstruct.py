@@ -11,6 +11,7 @@ from poem_jax.cli.options import (
     Detector,
     Flag,
     Folder,
+    Formats,
     MomentOptions,
     Moments,
     OptionalFile,
@@ -19,6 +20,7 @@ from poem_jax.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from poem_jax.capture.outputs.formats import Format
     from poem_jax.capture.write import Written
     from poem_jax.hand.model import HandModel
 
@@ -57,11 +59,16 @@ class Reconstruct:
     """With --engine fit, as for `poem fit`."""
     meshes: Flag = False
     """Write the meshes of every frame of a take too, not only its animation."""
+    formats: Formats = "glb"
+    """What to write besides arrays, page, report and overlays, with commas between: glb (animation of a
+    take), bvh (skeletons), csv (joints and angles), trc (markers), mano (parameters); video or png: overlays
+    as such, else as images of a take of up to 20 frames, and as videos of a longer one."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
     def run(self) -> None:
         """Write the results and print where they are."""
+        from poem_jax.capture.outputs.formats import formats_of
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
@@ -71,6 +78,7 @@ class Reconstruct:
             raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
         if self.engine == "network" and self.detector != "file":
             raise ValueError("--detector is for --engine fit; the network sees the images themselves")
+        formats = formats_of(self.formats)
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
         if self.checkpoint is not None and self.folder.is_dir():
@@ -80,7 +88,9 @@ class Reconstruct:
             self.folder, self.out, self.rig, self.max_hands, self.video, self.moments
         )
         with tells_what_is_left(self.out):
-            written = self._fit(boxes, hand) if self.engine == "fit" else self._reconstruct(boxes)
+            written = (
+                self._fit(boxes, hand, formats) if self.engine == "fit" else self._reconstruct(boxes, formats)
+            )
         print_files(written, self.out)
         print_summary(written.report)
 
@@ -92,15 +102,17 @@ class Reconstruct:
 
         check_rig(read_config(checkpoint), find_rig(self.folder, self.rig))
 
-    def _reconstruct(self, boxes: Path) -> "Written":
+    def _reconstruct(self, boxes: Path, formats: "frozenset[Format]") -> "Written":
         from poem_jax.capture.pipeline import reconstruct
         from poem_jax.capture.take import read_take
 
         take = read_take(self.folder, self.rig, boxes, self.moments.timing())
         say(f"{take.num_frames} frames; the first run on a machine compiles the model, once")
-        return reconstruct(take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None)
+        return reconstruct(
+            take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None, formats=formats
+        )
 
-    def _fit(self, boxes: Path, hand: "HandModel | None") -> "Written":
+    def _fit(self, boxes: Path, hand: "HandModel | None", formats: "frozenset[Format]") -> "Written":
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
         from poem_jax.cli.fit import named_detector
@@ -114,4 +126,5 @@ class Reconstruct:
             smooth=self.smooth,
             detector=named_detector(self.detector),
             meshes=self.meshes or None,
+            formats=formats,
         )

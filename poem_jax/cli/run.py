@@ -17,15 +17,19 @@ from poem_jax.cli.inspect import Inspect
 from poem_jax.cli.messages import set_up_logging
 from poem_jax.cli.pack import Pack
 from poem_jax.cli.reconstruct import Reconstruct
+from poem_jax.cli.retarget import Retarget
 from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop_on_signals
 from poem_jax.cli.train import Train
 
-Command = Demo | Reconstruct | Fit | Detect | Inspect | Train | Eval | ImportTorch | ExportTorch | Pack
+Command = (
+    Demo | Reconstruct | Fit | Detect | Retarget | Inspect | Train | Eval | ImportTorch | ExportTorch | Pack
+)
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
+    | Annotated[Retarget, tyro.conf.subcommand("retarget")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]

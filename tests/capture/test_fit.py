@@ -254,8 +254,27 @@ def test_the_command_writes_what_reconstruct_writes(files, fitted, tmp_path, cap
 def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
     keypoints, rig, images = files
     arguments = ["reconstruct", str(images), "--rig", str(rig), "--boxes", str(keypoints), "--out"]
-    assert main([*arguments, str(tmp_path / "out"), "--engine", "fit"]) == 0
-    assert "12 of 12 hands in 6 frames" in capsys.readouterr().out
+    formats = ["--formats", "glb,bvh,csv,trc,mano"]
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", *formats]) == 0
+    said = capsys.readouterr()
+    assert "12 of 12 hands in 6 frames" in said.out
+    for name in (
+        "hands.glb",
+        "right.bvh",
+        "left.bvh",
+        "joints.csv",
+        "joint_angles.csv",
+        "hands.trc",
+        "mano.npz",
+    ):
+        assert name in said.out
+        assert (tmp_path / "out" / name).is_file()
+    assert (
+        json.loads((tmp_path / "out" / "report.json").read_text())["animation"]["left"]["moves_by"]
+        == "skeleton"
+    )
+    assert main([*arguments, str(tmp_path / "out"), "--formats", "fbx"]) == 2
+    assert "--formats must be a list of glb, bvh" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", "--checkpoint", "ckpt"]) == 2
     assert "a fit has no weights" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--smooth"]) == 2

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.crop import crop_image
-from poem_jax.capture.write import make_gallery
+from poem_jax.capture.outputs.page import make_gallery
 from poem_jax.data.lens import picture_map, project_raw, take_picture
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.distortion import undistort_pixels

@@ -36,6 +36,8 @@ def test_outputs_of_a_take(make_capture, tmp_path, meshes, run):
             "reprojection_px": (3, 2, 3),
             "views_used": (3, 2, 3),
             "valid": (3, 2),
+            "bridged": (3, 2),
+            "time_s": (3,),
             "frames": (3,),
             "hand_side": (2,),
             "cameras": (3,),

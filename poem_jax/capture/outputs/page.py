@@ -1,0 +1,86 @@
+"""What the 3D page shows of a take: frames thinned out evenly, with small undistorted pictures."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from poem_jax.data.lens import PictureMap, picture_map, take_picture
+from poem_jax.geometry.distortion import undistort_pixels
+from poem_jax.geometry.rig import Rig
+from poem_jax.geometry.transforms import rigid, smallest_rotation
+from poem_jax.typing import Array, Float
+from poem_jax.viz.page import PageCamera, PageFrame
+
+PAGE_FRAMES = 120
+"""A take with more frames that hold a hand is thinned out evenly for the page."""
+LONG_TAKE = 20
+"""Frames beyond which pictures are smaller, and overlays become videos."""
+_PAGE_PICTURE_PX = 320
+_PAGE_PICTURE_PX_OF_LONG_TAKES = 200
+
+
+class Gallery(NamedTuple):
+    """The small ideal cameras whose pictures the page shows at the places of a rig's cameras."""
+
+    cameras: list[PageCamera]
+    maps: list[PictureMap]
+
+
+def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
+    """Prepare the page's pictures; those of a take that is long, or may be (None), are smaller."""
+    longer = _PAGE_PICTURE_PX_OF_LONG_TAKES if is_long(num_frames) else _PAGE_PICTURE_PX
+    pairs = [_page_camera(rig, view, longer) for view in range(rig.num_views)]
+    return Gallery([camera for camera, _ in pairs], [where for _, where in pairs])
+
+
+def is_long(num_frames: int | None) -> bool:
+    """Tell whether a take is long, or may be (None)."""
+    return num_frames is None or num_frames > LONG_TAKE
+
+
+class PageFrames:
+    """The frames of a page, gathered while a take goes by: those with a hand, thinned out evenly."""
+
+    def __init__(self) -> None:
+        self.kept: list[PageFrame] = []
+        self._every = 1
+        self._offered = 0
+
+    def offer(self, make: Callable[[], PageFrame]) -> None:
+        """Count a frame that holds a hand; make and keep it if its turn has come."""
+        if self._offered % self._every == 0:
+            self.kept.append(make())
+        self._offered += 1
+        if len(self.kept) > PAGE_FRAMES:
+            self.kept = self.kept[::2]
+            self._every *= 2
+
+
+def page_frame(
+    name: str,
+    vertices_world: Mapping[str, Float[Array, "vert 3"]],
+    images: Sequence[Array | None],
+    gallery: Gallery,
+) -> PageFrame:
+    """Make a frame of the page: the hands by name, and small undistorted pictures."""
+    views = zip(images, gallery.maps, strict=True)
+    pictures = [None if image is None else take_picture(image, at) for image, at in views]
+    return PageFrame(name, vertices_world, pictures)
+
+
+def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureMap]:
+    """Make a pinhole with a central axis that looks at the middle of a photograph, whose own axis may not."""
+    K, dist = rig.K[view], rig.dist[view]
+    width, height = (int(size) for size in rig.size_wh[view])
+    x, y = undistort_pixels(np.array([[width / 2, height / 2]]), K, dist)[0]
+    ray = np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
+    R_cam_from_picture = smallest_rotation(np.array([0.0, 0.0, 1.0]), ray)
+    scale = longer / max(width, height)
+    # Off its axis an image is stretched by the squared length of the ray.
+    focal_px = float(scale * (K[0, 0] + K[1, 1]) / 2 * (ray @ ray))
+    hw = (round(scale * height), round(scale * width))
+    K_picture = np.array([[focal_px, 0, hw[1] / 2], [0, focal_px, hw[0] / 2], [0, 0, 1]])
+    T_picture_from_world = rigid(R_cam_from_picture.T, np.zeros(3)) @ rig.T_cam_from_world[view]
+    where = picture_map(K, dist, K_picture, hw, 1 / scale, R_cam_from_picture)
+    return PageCamera(rig.names[view], T_picture_from_world, focal_px, hw), where
