@@ -28,11 +28,12 @@ from poem_jax.geometry.cameras import (
 from poem_jax.geometry.distortion import distort
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
+from poem_jax.hand.joint_weights import vertex_joint_weights
 from poem_jax.hand.model import mirror_pose
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
-from poem_jax.typing import Array, Int, Params
+from poem_jax.typing import Array, Float, Int, Params
 from poem_jax.weights import store
 
 MAX_BATCH = 4
@@ -55,6 +56,11 @@ class Network(NamedTuple):
         """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
         right = np.asarray(self.prepared.params["constants"]["hand"]["faces"])
         return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
+
+    def joint_weights(self) -> Float[Array, "778 21"]:
+        """Return how much each joint says about each vertex of the model's hand."""
+        hand = self.prepared.params["constants"]["hand"]
+        return vertex_joint_weights(hand["v_template"], hand["J_regressor"], hand["weights"])
 
 
 def load_network(checkpoint: str | os.PathLike | None) -> Network:

@@ -24,9 +24,10 @@ from poem_jax.capture.report import Clock
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
+from poem_jax.hand.joint_weights import vertex_joint_weights
 from poem_jax.hand.model import HandModel
 from poem_jax.io.writable import check_folder_is_writable
-from poem_jax.typing import Array, Int
+from poem_jax.typing import Array, Float, Int
 
 Engine = Callable[[Iterable[Frame], Take, Clock], Iterator[Frame]]
 """What finds the hands: a stream of frames in, the stream with images and results out."""
@@ -62,7 +63,8 @@ def reconstruct(
     clock.lap("load_model")
     engine = functools.partial(by_network, network=network)
     about = {"engine": "network", "weights": network.origin, "image_hw": network.config.image_hw}
-    return _run(take, Path(out), engine, network.faces(), clock, about, meshes, progress)
+    weights = network.joint_weights()
+    return _run(take, Path(out), engine, network.faces(), weights, clock, about, meshes, progress)
 
 
 def fit(
@@ -103,7 +105,8 @@ def fit(
     about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
     about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
-    return _run(take, Path(out), engine, faces, clock, about, meshes, progress)
+    weights = vertex_joint_weights(hands.right.v_template, hands.right.J_regressor, hands.right.weights)
+    return _run(take, Path(out), engine, faces, weights, clock, about, meshes, progress)
 
 
 def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Network) -> Iterator[Frame]:
@@ -128,6 +131,7 @@ def _run(
     out: Path,
     engine: Engine,
     faces: Mapping[str, Int[Array, "face 3"]],
+    joint_weights: Float[Array, "vert 21"],
     clock: Clock,
     about: Mapping[str, Any],
     meshes: bool | None,
@@ -141,5 +145,5 @@ def _run(
     frames = engine(take.frames, take, clock)
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
-    style = Style(faces, single if meshes is None else meshes, not single, origin_world)
+    style = Style(faces, single if meshes is None else meshes, not single, origin_world, joint_weights)
     return write_results(frames, take, out, style, clock, about)

@@ -122,7 +122,7 @@ class Report:
         """Write the file, whole or not at all. `about` says what the engine was."""
         content = {
             "timings_s": timings_s,
-            "reprojection": self._reprojection(),
+            "reprojection": self.reprojection(),
             **about,
             "warnings": self.warnings,
             "cameras": self._take.rig.names,
@@ -158,7 +158,13 @@ class Report:
             if self._best is None or hand.view_mask.sum() > self._best.view_mask.sum():
                 self._best = hand
 
-    def _reprojection(self) -> dict[str, Any]:
+    @property
+    def num_cameras(self) -> int:
+        """How many cameras the take has."""
+        return self._take.rig.num_views
+
+    def reprojection(self) -> dict[str, Any]:
+        """Return what the errors in the photographs are so far, and against what."""
         errors = np.concatenate(self._errors) if self._errors else np.zeros(0)
         seen = errors[np.isfinite(errors)]
         return {

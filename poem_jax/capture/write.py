@@ -7,6 +7,7 @@ written before the exception goes on its way.
 import functools
 import json
 import logging
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +16,10 @@ import cv2
 import numpy as np
 
 from poem_jax.capture.frame import Frame
+from poem_jax.capture.page_frame import page_facts, page_frame
 from poem_jax.capture.report import Clock, Report
 from poem_jax.capture.take import Take
-from poem_jax.data.lens import PictureMap, picture_map, project_raw, take_picture
+from poem_jax.data.lens import PictureMap, picture_map, project_raw
 from poem_jax.geometry.distortion import undistort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import rigid, smallest_rotation
@@ -29,7 +31,7 @@ from poem_jax.io.growing_npz import GrowingNpz
 from poem_jax.io.meshes import is_own_mesh, write_mesh
 from poem_jax.typing import Array, Float, Int, UInt8
 from poem_jax.viz.overlay import MeshInView, draw_overlay
-from poem_jax.viz.page import HAND_RGB, PageCamera, PageFrame, write_page
+from poem_jax.viz.page import HAND_RGB, Caption, PageCamera, PageFrame, write_page
 
 MESH_SUFFIXES = (".glb", ".obj")
 PREDICTION, REPORT, PAGE, ANIMATION = "prediction.npz", "report.json", "index.html", "hands.glb"
@@ -37,9 +39,10 @@ SECONDS_PER_FRAME = 1 / 30
 """Of the animation: what video cameras take; a capture does not say."""
 PAGE_FRAMES = 120
 """A take with more frames that hold a hand is thinned out evenly for the page."""
-_LONG_TAKE = 20
-_PAGE_PICTURE_PX = 320
-_PAGE_PICTURE_PX_OF_LONG_TAKES = 200
+_PAGE_PIXELS = 20e6
+"""Of all pictures of a page together: as JPEG they take 3 to 5 MB."""
+_LEAST_PICTURE_PX, _LARGEST_PICTURE_PX = 160, 800
+"""Longer side of a page's picture."""
 
 
 _SHAPES = {
@@ -93,6 +96,8 @@ class Style(NamedTuple):
     """Whether to write one animated mesh of the take."""
     origin_world: Float[Array, "3"]
     """Where the world in which the frames come has its origin in the capture's world."""
+    joint_weights: Float[Array, "vert 21"] | None = None
+    """How much each joint says about each vertex, for the page's colours; None = nothing is known of it."""
 
 
 def write_results(
@@ -181,9 +186,7 @@ class _Writer:
         if self._style.animation:
             self._animation.add(vertices)
         if vertices:
-            self._pages.offer(
-                functools.partial(page_frame, frame.name, vertices, frame.images, self._gallery)
-            )
+            self._pages.offer(functools.partial(page_frame, frame, self._take, *self._gallery))
 
     def finish(self, clock: Clock, about: Mapping[str, Any]) -> None:
         """Write what belongs to all frames."""
@@ -192,7 +195,7 @@ class _Writer:
             self.files.append(self._animation.write())
         elif is_own_mesh(self._out / ANIMATION):
             (self._out / ANIMATION).unlink()
-        self._write_page()
+        self._write_page(about)
         self.files.append(self.report.write(clock.rounded(), about))
 
     def close(self) -> None:
@@ -235,12 +238,16 @@ class _Writer:
             path = folder / f"overlay_{rig.names[view]}.png"
             self.files.append(write_png(path, draw_overlay(image, meshes)))
 
-    def _write_page(self) -> None:
+    def _write_page(self, about: Mapping[str, Any]) -> None:
         """Write the page if that can be done here; a warning says why not. The rest does not need it."""
+        kept, style = self._pages.kept, self._style
+        made = f"engine: {about['engine']}, {time.strftime('%d %B %Y, %H:%M')}"
+        caption = Caption(self._out.resolve().name, made, page_facts(self.report, kept))
+        more = {"caption": caption, "joint_weights": style.joint_weights}
         try:
-            page = write_page(self._out / PAGE, self._pages.kept, self._gallery.cameras, self._style.faces)
+            page = write_page(self._out / PAGE, kept, self._gallery.cameras, style.faces, **more)
             self.files.append(page)
-        except OSError as error:  # It takes a free port to record a page.
+        except OSError as error:
             _log.warning("the 3D page cannot be written, everything else is: %s", error)
 
     def _say_what_is_lost(self, frame: Frame) -> None:
@@ -310,10 +317,17 @@ class Gallery(NamedTuple):
 
 def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
     """Prepare the page's pictures; those of a take that is long, or may be (None), are smaller."""
-    short = num_frames is not None and num_frames <= _LONG_TAKE
-    longer = _PAGE_PICTURE_PX if short else _PAGE_PICTURE_PX_OF_LONG_TAKES
-    pairs = [_page_camera(rig, view, longer) for view in range(rig.num_views)]
+    frames = PAGE_FRAMES if num_frames is None else min(num_frames, PAGE_FRAMES)
+    pixels = _PAGE_PIXELS / (frames * rig.num_views)
+    pairs = [_page_camera(rig, view, _longer_side(rig, view, pixels)) for view in range(rig.num_views)]
     return Gallery([camera for camera, _ in pairs], [where for _, where in pairs])
+
+
+def _longer_side(rig: Rig, view: int, pixels: float) -> int:
+    """Return the longer side of a picture of so many pixels, within what a page can use."""
+    shorter, longer = sorted(rig.size_wh[view])
+    largest = min(_LARGEST_PICTURE_PX, int(longer))
+    return int(np.clip(np.sqrt(pixels * longer / shorter), min(_LEAST_PICTURE_PX, largest), largest))
 
 
 class PageFrames:
@@ -332,18 +346,6 @@ class PageFrames:
         if len(self.kept) > PAGE_FRAMES:
             self.kept = self.kept[::2]
             self._every *= 2
-
-
-def page_frame(
-    name: str,
-    vertices_world: Mapping[str, Float[Array, "vert 3"]],
-    images: Sequence[Array | None],
-    gallery: Gallery,
-) -> PageFrame:
-    """Make a frame of the page: the hands by name, and small undistorted pictures."""
-    views = zip(images, gallery.maps, strict=True)
-    pictures = [None if image is None else take_picture(image, at) for image, at in views]
-    return PageFrame(name, vertices_world, pictures)
 
 
 def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureMap]:
