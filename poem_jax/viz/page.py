@@ -24,7 +24,18 @@ from poem_jax.viz.page_content import PageHand as PageHand
 from poem_jax.viz.page_data import page_data
 
 _JPEG_QUALITY = 80
-_SCRIPTS = ("data", "measures", "geometry", "pictures", "scene", "marks", "panel", "cameras", "player", "main")
+_SCRIPTS = (
+    "data",
+    "measures",
+    "geometry",
+    "pictures",
+    "scene",
+    "marks",
+    "panel",
+    "cameras",
+    "player",
+    "main",
+)
 """Files of `page_client/`, in the order in which they need each other."""
 
 

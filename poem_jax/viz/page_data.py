@@ -1,7 +1,6 @@
 """What a page holds of a take, in JSON: names and numbers as they are, arrays as whole numbers of 16 bits.
 
-An array's entry is `offset + step * number`, or unknown where the number is `_UNKNOWN`. Letters of the shapes:
-F frames, H hands, V cameras.
+An array's entry is `offset + step * number`, or unknown where the number is `_UNKNOWN`.
 """
 
 import base64
@@ -58,9 +57,7 @@ def page_data(
         "bridged": [
             [name in frame.hands and frame.hands[name].bridged for name in names] for frame in frames
         ],
-        "pictures": [
-            [None if jpeg is None else _text(jpeg) for jpeg in frame.pictures] for frame in frames
-        ],
+        "pictures": [[None if jpeg is None else _text(jpeg) for jpeg in frame.pictures] for frame in frames],
         "arrays": _arrays(frames, names, len(cameras)),
         "faces": {side: _text(np.asarray(faces[side], "<u2").tobytes()) for side in faces},
         "joint_weights": None if joint_weights is None else _weights(joint_weights),
@@ -90,7 +87,7 @@ def _times(frames: Sequence[PageFrame]) -> list[float] | None:
 
 
 def _arrays(frames: Sequence[PageFrame], names: Sequence[str], views: int) -> dict[str, Any]:
-    """Return the arrays (F, H, ...) of all hands; None for those that no hand has."""
+    """Return the arrays (frame, hand, ...) of all hands; None for those that no hand has."""
     vertices = next((len(hand.vertices_world) for frame in frames for hand in frame.hands.values()), 0)
     points = {"vertices_world": (vertices, 3), "joints_world": (NUM_JOINTS, 3)}
     steps = {

@@ -26,9 +26,7 @@ def seen_by(rig, points_world):
 
 
 def found(points_world, **more):
-    return HandResult(
-        np.ones(3, bool), vertices_world=np.zeros((778, 3)), joints_world=points_world, **more
-    )
+    return HandResult(np.ones(3, bool), vertices_world=np.zeros((778, 3)), joints_world=points_world, **more)
 
 
 def made(rig, frame):
@@ -62,7 +60,7 @@ def test_key_points_lie_where_the_pages_own_cameras_see_the_joints(rig):
 
 
 def test_errors_are_those_of_what_the_detector_should_see(rig):
-    seen = seen_by(rig, joints()) + [3.0, 4.0]
+    seen = seen_by(rig, joints()) + np.array([3.0, 4.0])
     np.testing.assert_allclose(joint_errors_px(joints(), seen, rig), 5.0)
     both = np.stack([seen, seen])
     page, _ = made(rig, frame_of(rig, found(joints(1), expected_world=joints()), keypoints_px=both))

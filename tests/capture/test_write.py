@@ -23,9 +23,7 @@ def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
     assert all(frame.hands for frame in pages[0])
 
 
-def test_a_page_that_cannot_be_written_costs_the_page_alone(
-    make_capture, tmp_path, run, monkeypatch, caplog
-):
+def test_a_page_that_cannot_be_written_costs_the_page_alone(make_capture, tmp_path, run, monkeypatch, caplog):
     def full(*_, **__):
         raise OSError("no space left")
 

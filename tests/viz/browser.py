@@ -137,6 +137,13 @@ class Tab:
             self.call("Input.dispatchMouseEvent", type=kind, **place, **more)
         self.settle()
 
+    def key(self, key):
+        """Press and let go a key, by its name in the page's events."""
+        for kind in ("keyDown", "keyUp"):
+            text = {"text": key} if kind == "keyDown" and len(key) == 1 else {}
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, **text)
+        self.settle()
+
     def drag(self, selector, dx, dy):
         """Move the pointer with the left button held, from the middle of an element."""
         x, y, width, height = self.box(selector)

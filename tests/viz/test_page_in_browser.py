@@ -101,7 +101,10 @@ def test_a_camera_shows_its_picture_with_the_hand_at_its_place(open_page):
         for sign_x, sign_y in ((-1, 1), (1, -1), (1, 1)):
             corner = [int(hw[0] / 2 + sign_y * (half_h - 40)), int(hw[1] / 2 + sign_x * (half_w - 4))]
             np.testing.assert_allclose(stage[*corner], GREYS[index], atol=3)
-        beside = stage[hw[0] // 2, int(hw[1] / 2 - half_w - 6)]
+        margins = hw[0] / 2 - half_h, hw[1] / 2 - half_w
+        assert max(margins) > 12
+        middle = hw[0] // 2, hw[1] // 2
+        beside = stage[4, middle[1]] if margins[0] > margins[1] else stage[middle[0], 4]
         assert (np.abs(beside.astype(int) - GREYS[index]) > 10).any()
     tab.click("#show-pictures")
     assert (np.abs(tab.shot("#stage")[40, 640 - 312 // 2].astype(int) - GREYS[2]) > 10).any()
@@ -188,8 +191,7 @@ def test_the_free_view_turns_and_comes_back(open_page):
     turned = tab.shot("#stage")
     assert overlap(coloured(before), coloured(turned)) < 0.8
     tab.click("#cameras button:nth-of-type(2)")
-    tab.js("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
-    tab.settle()
+    tab.key("Escape")
     np.testing.assert_array_equal(tab.shot("#stage"), turned)
 
 

@@ -45,7 +45,7 @@ function drawAll() {
   if (scene.works && width && height) drawScene(view, ratio, colours);
   marks.begin(width, height, ratio);
   if (camera && state.keypoints) drawKeypoints(view, camera);
-  if (!camera && state.pictures) marks.names(view, colours.soft);
+  if (!camera && state.pictures) marks.names(view, quads, colours.soft);
   words(camera);
   panel.draw();
   strip.draw(state, bitmaps);

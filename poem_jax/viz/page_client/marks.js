@@ -1,7 +1,7 @@
 "use strict";
 /* What is drawn over the scene: key points of the camera that is looked through, and names of cameras. */
 
-const RING_PX = 3.6;
+const RING_PX = 3;
 
 class Marks {
   constructor(canvas) {
@@ -16,14 +16,17 @@ class Marks {
     this.pen.clearRect(0, 0, width, height);
   }
 
-  names(view, colour) {
+  /* The names of the cameras, above their pictures in the room. */
+  names(view, quads, colour) {
     this.pen.font = "11px system-ui, sans-serif";
     this.pen.textAlign = "center";
     this.pen.fillStyle = colour;
-    for (const camera of cameras) {
-      const at = projected(view, camera.position);
-      if (at) this.pen.fillText(camera.name, at[0], at[1] - 7);
-    }
+    cameras.forEach((camera, index) => {
+      const corners = quads[index].map((corner) => projected(view, corner));
+      if (corners.includes(null)) return;
+      const x = corners.reduce((sum, at) => sum + at[0], 0) / corners.length;
+      this.pen.fillText(camera.name, x, Math.min(...corners.map((at) => at[1])) - 6);
+    });
   }
 
   /* Key points as rings on thin bones; from each a line to where the joint of the mesh lies, a dot. */

@@ -6,15 +6,15 @@ const NO_COLOUR = [140, 148, 158];
 const MEASURES = [
   {
     name: "sigma", label: "Uncertainty", unit: "mm", factor: 1000, digits: 1, array: "sigma_m",
-    title: "Uncertainty of each joint, mm (one sigma)", of: (values) => values,
+    title: "Uncertainty per joint, mm (one sigma)", of: (values) => values,
   },
   {
     name: "error", label: "Reprojection", unit: "px", factor: 1, digits: 1, array: "error_px",
-    title: "From the key points to each joint, px", of: overViews,
+    title: "From key point to joint, px", of: overViews,
   },
   {
     name: "confidence", label: "Confidence", unit: "%", factor: 100, digits: 0, array: "confidence",
-    title: "How far the pictures bear each joint out, %", of: overViews, best: 1,
+    title: "Borne out by the pictures, %", of: overViews, best: 1,
   },
 ].filter((measure) => arrays[measure.array] !== null);
 

@@ -88,7 +88,7 @@ class Panel {
     bar.style.background = `linear-gradient(to right, ${STOPS.map((rgb) => css(rgb)).join(", ")})`;
     const ends = [best, measure.worst].map((value, end) => {
       const plain = +(value * measure.factor).toFixed(3);
-      return element("span", `${plain}${end && !measure.best ? " and more" : ""} ${measure.unit}`);
+      return element("span", `${plain} ${measure.unit}${end && !measure.best ? " and more" : ""}`);
     });
     return [bar, element("p", ends)];
   }
