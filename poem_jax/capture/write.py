@@ -41,8 +41,10 @@ PAGE_FRAMES = 120
 """A take with more frames that hold a hand is thinned out evenly for the page."""
 _PAGE_PIXELS = 20e6
 """Of all pictures of a page together: as JPEG they take 3 to 5 MB."""
-_LEAST_PICTURE_PX, _LARGEST_PICTURE_PX = 160, 800
+_LEAST_PICTURE_PX, _LARGEST_PICTURE_PX = 160, 640
 """Longer side of a page's picture."""
+_PICTURE_SAMPLES = 3.0
+"""Along each axis of a picture's pixel at most: the maps of eight large cameras stay below 150 MB."""
 
 
 _SHAPES = {
@@ -317,17 +319,19 @@ class Gallery(NamedTuple):
 
 def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
     """Prepare the page's pictures; those of a take that is long, or may be (None), are smaller."""
-    frames = PAGE_FRAMES if num_frames is None else min(num_frames, PAGE_FRAMES)
-    pixels = _PAGE_PIXELS / (frames * rig.num_views)
-    pairs = [_page_camera(rig, view, _longer_side(rig, view, pixels)) for view in range(rig.num_views)]
+    longer = picture_sides(rig, num_frames)
+    pairs = [_page_camera(rig, view, longer[view]) for view in range(rig.num_views)]
     return Gallery([camera for camera, _ in pairs], [where for _, where in pairs])
 
 
-def _longer_side(rig: Rig, view: int, pixels: float) -> int:
-    """Return the longer side of a picture of so many pixels, within what a page can use."""
-    shorter, longer = sorted(rig.size_wh[view])
-    largest = min(_LARGEST_PICTURE_PX, int(longer))
-    return int(np.clip(np.sqrt(pixels * longer / shorter), min(_LEAST_PICTURE_PX, largest), largest))
+def picture_sides(rig: Rig, num_frames: int | None) -> list[int]:
+    """Return the longer side of each camera's pictures: all of a page together have `_PAGE_PIXELS`, but none
+    is larger than its photograph, nor than a page can use, nor smaller than is worth looking at."""
+    frames = PAGE_FRAMES if num_frames is None else min(num_frames, PAGE_FRAMES)
+    shorter, longer = np.sort(rig.size_wh, axis=-1).T
+    wanted = np.sqrt(_PAGE_PIXELS / (frames * rig.num_views) * longer / shorter)
+    wanted = np.minimum(np.clip(wanted, _LEAST_PICTURE_PX, _LARGEST_PICTURE_PX), longer)
+    return [int(side) for side in wanted]
 
 
 class PageFrames:
@@ -361,5 +365,5 @@ def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureM
     hw = (round(scale * height), round(scale * width))
     K_picture = np.array([[focal_px, 0, hw[1] / 2], [0, focal_px, hw[0] / 2], [0, 0, 1]])
     T_picture_from_world = rigid(R_cam_from_picture.T, np.zeros(3)) @ rig.T_cam_from_world[view]
-    where = picture_map(K, dist, K_picture, hw, 1 / scale, R_cam_from_picture)
+    where = picture_map(K, dist, K_picture, hw, min(1 / scale, _PICTURE_SAMPLES), R_cam_from_picture)
     return PageCamera(rig.names[view], T_picture_from_world, focal_px, hw), where

@@ -8,7 +8,7 @@ from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.page_frame import joint_errors_px, page_facts, page_frame
 from poem_jax.capture.report import Report
 from poem_jax.capture.take import Take
-from poem_jax.capture.write import make_gallery
+from poem_jax.capture.write import make_gallery, picture_sides
 from poem_jax.data.lens import project_raw
 from poem_jax.geometry.cameras import project
 from poem_jax.hand.topology import ROOT_JOINT
@@ -111,15 +111,16 @@ def test_facts(rig, tmp_path):
     nothing.close()
 
 
-@pytest.mark.parametrize(("frames", "longest"), [(1, 240), (10_000, 240), (None, 240)])
-def test_pictures_are_not_enlarged(rig, frames, longest):
-    assert all(max(camera.hw) <= longest for camera in make_gallery(rig, frames).cameras)
-
-
 def test_the_pictures_of_a_page_share_its_size(rig):
-    large = rig._replace(size_wh=8 * rig.size_wh, K=rig.K * [[8], [8], [1]])
-    sizes = [make_gallery(large, number).cameras[0].hw for number in (1, 30, 120, 5000)]
-    assert sizes[0] == (600, 800)
-    for number, (height, width) in zip((30, 120), sizes[1:3], strict=True):
-        assert 3 * number * height * width == pytest.approx(20e6, rel=0.02)
-    assert sizes[3] == sizes[2]
+    large = rig._replace(size_wh=8 * rig.size_wh)
+    longest = [picture_sides(large, number)[0] for number in (1, 40, 120, 5000, None)]
+    assert longest[0] == 640
+    for number, side in zip((40, 120), longest[1:3], strict=True):
+        assert 3 * number * side**2 * 3 / 4 == pytest.approx(20e6, rel=0.02)
+    assert longest[3] == longest[4] == longest[2]
+
+
+def test_pictures_are_neither_enlarged_nor_too_small_to_look_at(rig):
+    assert picture_sides(rig, 1) == [240] * 3
+    many = rig._replace(size_wh=np.repeat(8 * rig.size_wh, 40, axis=0), names=("c",) * 120)
+    assert picture_sides(many, None) == [160] * 120
