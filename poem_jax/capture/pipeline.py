@@ -27,7 +27,7 @@ from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
 from poem_jax.hand.model import HandModel
 from poem_jax.io.writable import check_folder_is_writable
-from poem_jax.typing import Array, Int
+from poem_jax.typing import Array, Float, Int
 
 Engine = Callable[[Iterable[Frame], Take, Clock], Iterator[Frame]]
 """What finds the hands: a stream of frames in, the stream with images and results out."""
@@ -135,6 +135,7 @@ def _run(
     out: Path,
     engine: Engine,
     faces: Mapping[str, Int[Array, "face 3"]],
+    joint_weights: Float[Array, "vert 21"],
     clock: Clock,
     about: Mapping[str, Any],
     meshes: bool | None,

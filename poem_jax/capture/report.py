@@ -129,7 +129,7 @@ class Report:
         """Write the file, whole or not at all. `about` says what the engine was."""
         content = {
             "timings_s": timings_s,
-            "reprojection": self._reprojection(),
+            "reprojection": self.reprojection(),
             **about,
             "warnings": self.warnings,
             "cameras": self._take.rig.names,
@@ -174,7 +174,13 @@ class Report:
         steps = steps[np.isfinite(steps) & (steps > 0)]
         return float(1 / np.median(steps)) if steps.size else None
 
-    def _reprojection(self) -> dict[str, Any]:
+    @property
+    def num_cameras(self) -> int:
+        """How many cameras the take has."""
+        return self._take.rig.num_views
+
+    def reprojection(self) -> dict[str, Any]:
+        """Return what the errors in the photographs are so far, and against what."""
         errors = np.stack(self._errors) if self._errors else np.zeros((0, self._take.rig.num_views))
         seen = errors[np.isfinite(errors)]
         medians = {

@@ -7,6 +7,7 @@ written before the exception goes on its way. Each kind of file has a home of it
 import functools
 import json
 import logging
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,15 +19,17 @@ from poem_jax.capture.outputs.exports import ANIMATION, export_files, write_expo
 from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
 from poem_jax.capture.outputs.meshes import remove_own_meshes, write_frame_meshes
 from poem_jax.capture.outputs.overlays import Drawn, OverlayVideos, draw_views, write_png
-from poem_jax.capture.outputs.page import PageFrames, is_long, make_gallery, page_frame
+from poem_jax.capture.outputs.page import PageFrames, is_long, make_gallery
+from poem_jax.capture.outputs.page_frame import page_facts, page_frame
 from poem_jax.capture.outputs.prediction import PredictionFile
 from poem_jax.capture.report import Clock, Report
 from poem_jax.capture.take import Take
+from poem_jax.hand.joint_weights import vertex_joint_weights
 from poem_jax.hand.model import HandModel
 from poem_jax.io.file_names import safe_file_name, safe_file_names
 from poem_jax.io.meshes import is_own_mesh
 from poem_jax.typing import Array, Float, Int
-from poem_jax.viz.page import write_page
+from poem_jax.viz.page import Caption, write_page
 
 PREDICTION, REPORT, PAGE = "prediction.npz", "report.json", "index.html"
 
@@ -78,6 +81,13 @@ class Style(NamedTuple):
     def of_take(self) -> frozenset[Format]:
         """The formats without the animation where there is none to be."""
         return self.formats if self.animation else self.formats - {Format.GLB}
+
+    def joint_weights(self) -> Float[Array, "vert 21"] | None:
+        """Return how much each joint says about each vertex, None where nothing is known of it."""
+        if self.hands is None:
+            return None
+        hand = self.hands["right"]
+        return vertex_joint_weights(hand.v_template, hand.J_regressor, hand.weights)
 
 
 def write_results(
@@ -158,9 +168,7 @@ class _Writer:
         if self.report.solved and self._prediction.is_due():
             self._prediction.write()
         if vertices:
-            self._pages.offer(
-                functools.partial(page_frame, frame.name, vertices, frame.images, self._gallery)
-            )
+            self._pages.offer(functools.partial(page_frame, frame, self._take, *self._gallery))
 
     def finish(self, clock: Clock, about: Mapping[str, Any]) -> None:
         """Write what belongs to all frames; if a part of it cannot be, the rest is there."""
@@ -170,7 +178,7 @@ class _Writer:
             exported = self._write_exports()
             self.files += self._videos.finish()
         finally:
-            self._write_page()
+            self._write_page(about)
             self.files.append(self.report.write(clock.rounded(), {**about, **exported}))
 
     def close(self) -> None:
@@ -211,12 +219,16 @@ class _Writer:
                 _log.warning("%s is of an earlier run, and does not belong to these results", path)
         return exports.about
 
-    def _write_page(self) -> None:
+    def _write_page(self, about: Mapping[str, Any]) -> None:
         """Write the page if that can be done here; a warning says why not. The rest does not need it."""
+        kept, style = self._pages.kept, self._style
+        made = f"engine: {about['engine']}, {time.strftime('%d %B %Y, %H:%M')}"
+        caption = Caption(self._out.resolve().name, made, page_facts(self.report, kept))
+        more = {"caption": caption, "joint_weights": style.joint_weights()}
         try:
-            page = write_page(self._out / PAGE, self._pages.kept, self._gallery.cameras, self._style.faces)
+            page = write_page(self._out / PAGE, kept, self._gallery.cameras, style.faces, **more)
             self.files.append(page)
-        except OSError as error:  # It takes a free port to record a page.
+        except OSError as error:
             _log.warning("the 3D page cannot be written, everything else is: %s", error)
 
     def _say_what_is_lost(self, frame: Frame) -> None:

@@ -16,7 +16,7 @@ def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
 ):
     pages = []
     monkeypatch.setattr(page, "PAGE_FRAMES", 2)
-    monkeypatch.setattr(write, "write_page", lambda path, frames, *_: pages.append(frames) or path)
+    monkeypatch.setattr(write, "write_page", lambda path, frames, *_, **__: pages.append(frames) or path)
     capture = make_capture(7)
     capture.hands.boxes_px[::2] = np.nan
     write_boxes(capture.folder / "boxes.npz", capture.hands)
@@ -25,16 +25,14 @@ def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
     assert all(frame.hands for frame in pages[0])
 
 
-def test_a_page_that_cannot_be_recorded_costs_the_page_alone(
-    make_capture, tmp_path, run, monkeypatch, caplog
-):
-    def no_port(*_):
-        raise OSError("no free port")
+def test_a_page_that_cannot_be_written_costs_the_page_alone(make_capture, tmp_path, run, monkeypatch, caplog):
+    def full(*_, **__):
+        raise OSError("no space left")
 
-    monkeypatch.setattr(write, "write_page", no_port)
+    monkeypatch.setattr(write, "write_page", full)
     run(make_capture(), tmp_path / "out")
     assert (tmp_path / "out" / "report.json").exists()
-    assert "the 3D page cannot be written, everything else is: no free port" in caplog.text
+    assert "the 3D page cannot be written, everything else is: no space left" in caplog.text
 
 
 def test_a_new_run_removes_its_own_meshes_of_hands_that_it_lost(make_capture, tmp_path, run):

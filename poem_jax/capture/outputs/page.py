@@ -1,23 +1,26 @@
 """What the 3D page shows of a take: frames thinned out evenly, with small undistorted pictures."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from poem_jax.data.lens import PictureMap, picture_map, take_picture
+from poem_jax.data.lens import PictureMap, picture_map
 from poem_jax.geometry.distortion import undistort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import rigid, smallest_rotation
-from poem_jax.typing import Array, Float
 from poem_jax.viz.page import PageCamera, PageFrame
 
 PAGE_FRAMES = 120
 """A take with more frames that hold a hand is thinned out evenly for the page."""
 LONG_TAKE = 20
-"""Frames beyond which pictures are smaller, and overlays become videos."""
-_PAGE_PICTURE_PX = 320
-_PAGE_PICTURE_PX_OF_LONG_TAKES = 200
+"""Frames beyond which overlays become videos."""
+_PAGE_PIXELS = 20e6
+"""Of all pictures of a page together: as JPEG they take 3 to 5 MB."""
+_LEAST_PICTURE_PX, _LARGEST_PICTURE_PX = 160, 640
+"""Longer side of a page's picture."""
+_PICTURE_SAMPLES = 3.0
+"""Along each axis of a picture's pixel at most: the maps of eight large cameras stay below 150 MB."""
 
 
 class Gallery(NamedTuple):
@@ -29,9 +32,19 @@ class Gallery(NamedTuple):
 
 def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
     """Prepare the page's pictures; those of a take that is long, or may be (None), are smaller."""
-    longer = _PAGE_PICTURE_PX_OF_LONG_TAKES if is_long(num_frames) else _PAGE_PICTURE_PX
-    pairs = [_page_camera(rig, view, longer) for view in range(rig.num_views)]
+    longer = picture_sides(rig, num_frames)
+    pairs = [_page_camera(rig, view, longer[view]) for view in range(rig.num_views)]
     return Gallery([camera for camera, _ in pairs], [where for _, where in pairs])
+
+
+def picture_sides(rig: Rig, num_frames: int | None) -> list[int]:
+    """Return the longer side of each camera's pictures: all of a page together have `_PAGE_PIXELS`, but none
+    is larger than its photograph, nor than a page can use, nor smaller than is worth looking at."""
+    frames = PAGE_FRAMES if num_frames is None else min(num_frames, PAGE_FRAMES)
+    shorter, longer = np.sort(rig.size_wh, axis=-1).T
+    wanted = np.sqrt(_PAGE_PIXELS / (frames * rig.num_views) * longer / shorter)
+    wanted = np.minimum(np.clip(wanted, _LEAST_PICTURE_PX, _LARGEST_PICTURE_PX), longer)
+    return [int(side) for side in wanted]
 
 
 def is_long(num_frames: int | None) -> bool:
@@ -57,18 +70,6 @@ class PageFrames:
             self._every *= 2
 
 
-def page_frame(
-    name: str,
-    vertices_world: Mapping[str, Float[Array, "vert 3"]],
-    images: Sequence[Array | None],
-    gallery: Gallery,
-) -> PageFrame:
-    """Make a frame of the page: the hands by name, and small undistorted pictures."""
-    views = zip(images, gallery.maps, strict=True)
-    pictures = [None if image is None else take_picture(image, at) for image, at in views]
-    return PageFrame(name, vertices_world, pictures)
-
-
 def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureMap]:
     """Make a pinhole with a central axis that looks at the middle of a photograph, whose own axis may not."""
     K, dist = rig.K[view], rig.dist[view]
@@ -82,5 +83,5 @@ def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureM
     hw = (round(scale * height), round(scale * width))
     K_picture = np.array([[focal_px, 0, hw[1] / 2], [0, focal_px, hw[0] / 2], [0, 0, 1]])
     T_picture_from_world = rigid(R_cam_from_picture.T, np.zeros(3)) @ rig.T_cam_from_world[view]
-    where = picture_map(K, dist, K_picture, hw, 1 / scale, R_cam_from_picture)
+    where = picture_map(K, dist, K_picture, hw, min(1 / scale, _PICTURE_SAMPLES), R_cam_from_picture)
     return PageCamera(rig.names[view], T_picture_from_world, focal_px, hw), where
