@@ -4,7 +4,6 @@ import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,28 +46,6 @@ class Moments(NamedTuple):
                 if image is not None:
                     found[image.video.path if isinstance(image, VideoFrame) else image] = None
         return list(found)
-
-
-@dataclass(frozen=True)
-class PickedFrames(Sequence[FramePaths]):
-    """Some of the frames of a capture, in any order."""
-
-    frames: Sequence[FramePaths]
-    rows: Sequence[int]
-    """Which ones; -1 = a frame without images."""
-    names: Sequence[str] = ()
-    """Of frames without images."""
-    num_views: int = 0
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __getitem__(self, index):
-        """Return a frame, or those of a slice."""
-        if isinstance(index, slice):
-            return PickedFrames(self.frames, self.rows[index], self.names[index], self.num_views)
-        row = self.rows[index]
-        return FramePaths(self.names[index], (None,) * self.num_views) if row < 0 else self.frames[row]
 
 
 def find_moments(folder: str | os.PathLike, rig: Rig, timing: Timing = _WHOLE) -> Moments:
@@ -170,7 +147,7 @@ def _part(moments: Moments, timing: Timing) -> Moments:
         return moments
     rate = moments.frames_per_second
     rate = None if rate is None else rate / timing.every
-    return moments._replace(frames=PickedFrames(moments.frames, rows), frames_per_second=rate)
+    return moments._replace(frames=moments.frames[start : end : timing.every], frames_per_second=rate)
 
 
 def _index(place: Place, moments: Moments, option: str) -> int:

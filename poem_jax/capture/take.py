@@ -17,7 +17,8 @@ from poem_jax.capture.boxes_file import (
     without_boxes_outside,
 )
 from poem_jax.capture.frame import Frame
-from poem_jax.capture.moments import Moments, PickedFrames, find_moments
+from poem_jax.capture.moments import Moments, find_moments
+from poem_jax.capture.picked_frames import PickedFrames
 from poem_jax.capture.timing import Timing
 from poem_jax.data.capture_folder import FramePaths, find_rig, frame_key, hand_names
 from poem_jax.geometry.rig import Rig

@@ -8,8 +8,9 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
+from poem_jax.capture.picked_frames import PickedFrames
 from poem_jax.data.capture_folder import FramePaths
 from poem_jax.io.video import Video, VideoFrame
 
@@ -76,7 +77,14 @@ class VideoMoments(Sequence[FramePaths]):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index: int) -> FramePaths:
+    @overload
+    def __getitem__(self, index: int) -> FramePaths: ...
+    @overload
+    def __getitem__(self, index: slice) -> PickedFrames: ...
+    def __getitem__(self, index: int | slice) -> FramePaths | PickedFrames:
+        """Return a moment, or those of a slice."""
+        if isinstance(index, slice):
+            return PickedFrames(self, range(self._count)[index])
         if not -self._count <= index < self._count:
             raise IndexError(index)
         index %= self._count
