@@ -61,7 +61,7 @@ class Chosen(NamedTuple):
     """The take to work on: the one that was given, whole."""
 
 
-def engine_for(take: Take, name: EngineName, options: EngineOptions) -> Chosen:
+def engine_for(take: Take, name: EngineName | str, options: EngineOptions) -> Chosen:
     """Make the engine of a name ready; "auto" looks which of them can run, and tries both if both can.
 
     Raises:
@@ -87,7 +87,7 @@ def engine_for(take: Take, name: EngineName, options: EngineOptions) -> Chosen:
     return Chosen(engine, choice, take)
 
 
-def _check_options(name: EngineName, options: EngineOptions) -> None:
+def _check_options(name: EngineName | str, options: EngineOptions) -> None:
     if name not in get_args(EngineName):
         raise ValueError(f"`engine` must be one of {', '.join(get_args(EngineName))}; got {name!r}")
     if name == "fit" and (options.checkpoint is not None or options.network is not None):

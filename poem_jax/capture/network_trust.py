@@ -3,8 +3,8 @@
 Two signs of doubt are told in metres, joint by joint: how far its decoder still moved the joint from layer
 to layer, and how narrowly its heat maps fix the joint where the views' rays cross. What they are worth is
 measured on synthetic captures (`tools/measure_trust.py`): they are combined to a standard deviation within
-which 68 % of the errors of a coordinate lie. A view's confidence in a joint is its heat map's sharpness, times
-how well the joint lies where the heat map has it.
+which 68 % of the errors of a coordinate lie. A view's confidence in a joint is its heat map's sharpness,
+times how well the joint lies where the heat map has it.
 """
 
 from typing import NamedTuple

@@ -25,7 +25,7 @@ def reconstruct(
     take: Take,
     out: str | os.PathLike,
     *,
-    engine: EngineName = "auto",
+    engine: EngineName | str = "auto",
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
     hand: HandModel | None = None,
