@@ -3,7 +3,7 @@
     python tools/measure_trust.py [--checkpoint DIR] [--samples 150]
 
 Synthetic captures of the benchmark's distribution, seen by 2, 3, 4 and 8 views. The scale is measured on one
-seed: floor and factors by the least absolute errors in units of their standard deviation (Laplace's
+seed: factors by the least absolute errors in units of their standard deviation (Laplace's
 likelihood, which a few lost hands do not rule), then all of it widened or narrowed until 68.3 % of the
 coordinates lie within one. The shares are told for another seed, that of the benchmark, which was used for
 neither training nor measuring. The fit's confidence is told for takes of key points of which one in ten lies
@@ -99,10 +99,10 @@ def measured_scale(rows: dict[int, list[Observed]]) -> TrustScale:
     )
 
     def scale_of(logs: np.ndarray) -> TrustScale:
-        floor, layers, rays = map(float, np.exp(logs))
+        layers, rays = map(float, np.exp(logs))
         # The distance in a plane has its median at 1.177 standard deviations of a coordinate.
         off_share = float(np.median(off[visible])) / 1.1774
-        return TrustScale(floor, layers, rays, float(np.median(spread[visible])), off_share, True)
+        return TrustScale(layers, rays, float(np.median(spread[visible])), off_share, True)
 
     def sigmas(scale: TrustScale) -> np.ndarray:
         return np.stack([joint_sigma(row.doubts, scale) for row in seen])[..., None]
@@ -111,7 +111,7 @@ def measured_scale(rows: dict[int, list[Observed]]) -> TrustScale:
         sigma = sigmas(scale_of(logs))
         return float(np.mean(np.log(sigma) + np.abs(error_m) / sigma))
 
-    logs = minimize(cost, np.log([0.002, 1.0, 0.5]), method="Nelder-Mead").x
+    logs = minimize(cost, np.log([1.0, 0.5]), method="Nelder-Mead").x
     units = np.abs(error_m) / sigmas(scale_of(logs))
     return scale_of(logs + np.log(np.quantile(units, WITHIN_ONE_SIGMA)))
 

@@ -39,7 +39,8 @@ class EngineChoice(NamedTuple):
     figures: Mapping[str, Mapping[str, float | None]] = {}
     """By engine: `left_out_px`, median distance of its joints from the key points in views that it was not
     given (pixels of the photographs), or `sigma_mm`, median standard deviation of a coordinate of a joint, by
-    its own account; None = it found less than half of the hands. And `hands_lost`, a share."""
+    its own account; None = it found less than half of the hands, or does not know. And `hands_lost`, a
+    share."""
     frames: tuple[str, ...] = ()
     """Names of the frames that were tried."""
 
@@ -215,7 +216,7 @@ def _own_uncertainty(take: Take, frames: Sequence[Frame], find: Find) -> dict[st
         for hand in np.flatnonzero(seen_hands(frame).sum(-1) > 1):
             sigma = found.hands[hand].joint_sigma_m
             sigmas.append(np.full(1, np.inf) if sigma is None else np.asarray(sigma))
-            lost.append(sigma is None)
+            lost.append(found.hands[hand].joints_world is None)
     median_m = _median(sigmas)
     share = float(np.mean(lost)) if lost else 1.0
     return {"sigma_mm": None if median_m is None else 1000 * median_m, "hands_lost": share}
@@ -233,9 +234,6 @@ def _least(figures: Mapping[str, Mapping[str, float | None]], figure: str, meani
     values = {name: np.inf if row[figure] is None else row[figure] for name, row in figures.items()}
     best = min(values, key=lambda name: values[name])
     if np.isinf(values[best]):
-        return best, "no engine found half of the hands that were tried"
-    told = [
-        f"{name} {'lost half of the hands or more' if np.isinf(value) else f'{value:.1f}'}"
-        for name, value in values.items()
-    ]
+        return best, "neither engine found half of the hands that were tried, or says how sure it is"
+    told = [f"{name} {'none' if np.isinf(value) else f'{value:.1f}'}" for name, value in values.items()]
     return best, f"{', '.join(told)} ({meaning})"

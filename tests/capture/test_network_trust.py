@@ -54,7 +54,6 @@ def test_the_standard_deviation_grows_with_every_sign_of_doubt():
     least = joint_sigma(doubts_of(*example(), ORDER), SHIPPED)
     for more in ({"spread_px": 12.0}, {"steps_m": (0.01,)}, {"views": 2}, {"off_px": 10.0}):
         assert (joint_sigma(doubts_of(*example(**more), ORDER), SHIPPED) > least).all(), more
-    assert (least > SHIPPED.floor_m).all()
 
 
 def test_confidence_falls_with_spread_and_distance_and_is_nan_where_nothing_is_seen():
@@ -84,8 +83,9 @@ def test_a_model_without_heat_maps_has_its_layers_alone():
     found, crops = example()
     doubts = doubts_of(found._replace(keypoints_px=None, heat_maps=None), crops, ORDER)
     assert joint_confidence(doubts, SHIPPED) is None
-    expected = np.hypot(SHIPPED.floor_m, SHIPPED.of_layers * doubts.layers_m)
-    np.testing.assert_allclose(joint_sigma(doubts, SHIPPED), expected)
+    np.testing.assert_allclose(joint_sigma(doubts, SHIPPED), SHIPPED.of_layers * doubts.layers_m)
+    last = found._replace(keypoints_px=None, heat_maps=None, layers_world=found.layers_world[-1:])
+    assert joint_sigma(doubts_of(last, crops, ORDER), SHIPPED) is None
 
 
 def test_the_order_of_the_views_is_of_no_account():
