@@ -4,6 +4,8 @@ A row is a function that prints what it measured; `ROWS` lists them.
 
     detection   frames a second of the search for hands in four real videos (--data: the folder `data` of the
                 reference material, with caliscope_4cam_video and caliscope_4cam_hands)
+    fit         key points given, engine fit: 4 cameras, two hands, the whole way from a take to its files,
+                without images, so that no overlay is drawn
     memory      memory of a search, then of a fit, after 200 and after 2,000 frames of a synthetic take
 """
 
@@ -20,22 +22,26 @@ import cv2
 import numpy as np
 
 from poem_jax.calibration.rig_json import read_rig, write_rig
-from poem_jax.capture.boxes_file import write_boxes
+from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.detect import detect_hands
 from poem_jax.capture.detections import SearchFile
 from poem_jax.capture.moments import find_moments
-from poem_jax.capture.pipeline import fit
-from poem_jax.capture.take import read_keypoint_take
+from poem_jax.capture.pipeline import fit, reconstruct
+from poem_jax.capture.take import Take, make_take, read_keypoint_take
+from poem_jax.data.capture_folder import FramePaths
 from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.io.compilation_cache import use_compilation_cache
+from poem_jax.synthetic.keypoint_takes import IMAGE_WH, draw_keypoint_take
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FRAMES, EARLY = 2000, 200
 SIZE_WH = (320, 240)
+FIT_FRAMES, FIT_VIEWS, FIT_NOISE_PX = 640, 4, 2.0
+SIDES = ("right", "left")
 
 
 def detection(data: Path) -> None:
@@ -60,6 +66,39 @@ def detection(data: Path) -> None:
             f"(median of {len(seconds)}, association and decoding in it), "
             f"{np.median(cpu_seconds) / len(frames):.2f} CPU seconds a frame"
         )
+
+
+def keypoint_take(num_frames: int) -> Take:
+    """Return both hands of a synthetic take in one rig, as key points without images."""
+    drawn = [draw_keypoint_take(default_hand(side), num_frames, FIT_VIEWS, FIT_NOISE_PX, 7) for side in SIDES]
+    rig = Rig(
+        tuple(f"cam_{view}" for view in range(FIT_VIEWS)),
+        np.tile(IMAGE_WH, (FIT_VIEWS, 1)),
+        drawn[0].K.astype(np.float64),
+        np.zeros((FIT_VIEWS, 5)),
+        drawn[0].T_cam_from_world.astype(np.float64),
+    )
+    keypoints = np.stack([take.uv_px for take in drawn], 1).astype(np.float64)
+    names = tuple(f"{frame:05d}" for frame in range(num_frames))
+    hands = HandBoxes(boxes_from_keypoints(keypoints), SIDES, names, keypoints)
+    return make_take(rig, [FramePaths(name, (None,) * FIT_VIEWS) for name in names], hands)
+
+
+def fit_rate(_: Path) -> None:
+    """Print frames a second of the fit, and where its time goes."""
+    with tempfile.TemporaryDirectory() as folder:
+        reconstruct(keypoint_take(64), Path(folder) / "first", engine="fit", progress=False)
+        written = reconstruct(keypoint_take(FIT_FRAMES), Path(folder) / "out", engine="fit", progress=False)
+        spent = written.report["timings_s"]
+    shares = ", ".join(
+        f"{name} {100 * seconds / spent['total']:.0f} %"
+        for name, seconds in spent.items()
+        if name != "total" and seconds > 0.01 * spent["total"]
+    )
+    print(
+        f"fit: {FIT_FRAMES / spent['total']:.1f} frames/s of {FIT_VIEWS} cameras and {len(SIDES)} hands "
+        f"({shares})"
+    )
 
 
 def memory(_: Path) -> None:
@@ -163,7 +202,7 @@ def planted(rig: Rig, turns: Iterator[int]) -> Callable[..., list[list[DetectedH
     return detect
 
 
-ROWS: dict[str, Callable[[Path], None]] = {"detection": detection, "memory": memory}
+ROWS: dict[str, Callable[[Path], None]] = {"detection": detection, "fit": fit_rate, "memory": memory}
 """Every row takes the folder of real data."""
 
 

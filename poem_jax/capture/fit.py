@@ -16,6 +16,7 @@ from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.lens_reach import beyond_the_lens
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
+from poem_jax.capture.fit_trust import joint_confidence
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
@@ -101,14 +102,44 @@ def fit_hands(
             lost = np.isfinite(raw).all(-1) & ~np.isfinite(keypoints).all(-1)
             warnings += beyond_the_lens(take.rig, lost.sum((0, 1, 3)), "key points")
             told = bool(lost.any())
-        fitted = []
+        fitted, trusted = [], []
         for index, hand in enumerate(fits):
-            fitted.append(hand.fit(keypoints[:, index], confidence[:, index], take.rig))
+            given = keypoints[:, index], confidence[:, index]
+            fitted.append(hand.fit(*given, take.rig))
+            trusted.append(joint_confidence(fitted[-1], *given, take.rig))
             warnings += hand.take_warnings()
-        for turn in turns:
-            results = tuple(_result(result, turn) for result in fitted)
-            yield group[turn]._replace(hands=results, warnings=(*group[turn].warnings, *warnings))
+        for frame in _with_results(group, turns, fitted, trusted):
+            yield frame._replace(warnings=(*frame.warnings, *warnings))
             warnings = []
+
+
+def try_fit(
+    frames: Iterable[Frame], take: Take, hands: Hands, detector: str | None = None
+) -> Iterator[Frame]:
+    """Fit the hands of a few frames as `fit_hands` does, but judge neither the rig nor the sides.
+
+    Each hand has one shape in all of them.
+    """
+    group = list(frames)
+    raw, confidence = _observed(group)
+    keypoints = ideal_keypoints(take.rig, raw)
+    config = fit_config(take.rig, smooth=False)
+    offsets = offsets_of(take.detector if detector is None else detector)
+    fitted, trusted = [], []
+    for index, side in enumerate(take.hand_sides):
+        given, model = (keypoints[:, index], confidence[:, index]), _keypoint_models(hands, side, offsets)[0]
+        fitted.append(_run(model, *given, take.rig, config, None))
+        trusted.append(joint_confidence(fitted[-1], *given, take.rig))
+    yield from _with_results(group, range(len(group)), fitted, trusted)
+
+
+def _with_results(
+    group: list[Frame], turns: range, fitted: list["FitResult"], trusted: list[Array]
+) -> Iterator[Frame]:
+    """Give the frames whose turn it is what came of their hands."""
+    for turn in turns:
+        pairs = zip(fitted, trusted, strict=True)
+        yield group[turn]._replace(hands=tuple(_result(fit, turn, trust) for fit, trust in pairs))
 
 
 def _keypoint_models(
@@ -210,7 +241,7 @@ def _run(
     return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
 
 
-def _result(fitted: "FitResult", turn: int) -> HandResult:
+def _result(fitted: "FitResult", turn: int, trusted: Array) -> HandResult:
     used = fitted.inlier_mask[turn].any(-1)
     if not fitted.valid[turn]:
         return HandResult(used, NOT_FITTED)
@@ -224,4 +255,5 @@ def _result(fitted: "FitResult", turn: int) -> HandResult:
         translation=fitted.translation[turn],
         expected_world=fitted.keypoints[turn],
         joint_sigma_m=fitted.sigma_m[turn],
+        joint_confidence=trusted[turn],
     )

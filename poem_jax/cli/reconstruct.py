@@ -30,8 +30,8 @@ class Reconstruct:
     """Reconstruct the hands of a capture: meshes, overlays, a 3D page, arrays and a report.
 
     DIR holds a video for each camera, <camera>.mp4, or a folder of images, <camera>/0001.jpg; or one image,
-    <camera>.jpg or .png; or frames/<frame>/<camera>.jpg. Boxes or
-    2D key points may say where the hands are in each view, else they are looked for; see docs/captures.md.
+    <camera>.jpg or .png; or frames/<frame>/<camera>.jpg. Boxes or 2D key points may say where the hands are
+    in each view, else they are looked for; see docs/captures.md.
     """
 
     folder: PositionalFolder
@@ -47,16 +47,18 @@ class Reconstruct:
     video: Flag = False
     """As for `poem detect`."""
     moments: MomentOptions = Moments()
+    engine: Literal["auto", "fit", "poem", "network"] = "auto"
+    """poem (or network): the network, from the images. fit: no network, the hand model fitted to key points
+    (if boxes are given they must hold them). auto: both are tried on a few frames, by views that neither is
+    given, and the better one does the take; where only one can run, it does."""
     checkpoint: OptionalFolder = None
-    """Model folder that poem_jax.save wrote; without it the shipped weights."""
-    engine: Literal["network", "fit"] = "network"
-    """fit: no network, the hand model fitted to key points (if boxes are given they must hold them)."""
+    """Of the network: model folder that poem_jax.save wrote; without it the shipped weights."""
     mano: OptionalFile = None
-    """With --engine fit, as for `poem fit`."""
+    """Of the fit, as for `poem fit`."""
     smooth: Flag = False
-    """With --engine fit, as for `poem fit`."""
+    """Of the fit, as for `poem fit`."""
     detector: Detector = "file"
-    """With --engine fit, as for `poem fit`."""
+    """Of the fit, as for `poem fit`."""
     meshes: Flag = False
     """Write the meshes of every frame of a take too, not only its animation."""
     formats: Formats = "glb"
@@ -72,11 +74,12 @@ class Reconstruct:
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
-        if self.engine == "fit" and self.checkpoint is not None:
-            raise ValueError("--checkpoint is for --engine network; a fit has no weights")
-        if self.engine == "network" and (self.mano is not None or self.smooth):
+        engine = "poem" if self.engine == "network" else self.engine
+        if engine == "fit" and self.checkpoint is not None:
+            raise ValueError("--checkpoint is for --engine poem; a fit has no weights")
+        if engine == "poem" and (self.mano is not None or self.smooth):
             raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
-        if self.engine == "network" and self.detector != "file":
+        if engine == "poem" and self.detector != "file":
             raise ValueError("--detector is for --engine fit; the network sees the images themselves")
         formats = formats_of(self.formats)
         check_folder_is_writable(self.out)
@@ -88,9 +91,7 @@ class Reconstruct:
             self.folder, self.out, self.rig, self.max_hands, self.video, self.moments
         )
         with tells_what_is_left(self.out):
-            written = (
-                self._fit(boxes, hand, formats) if self.engine == "fit" else self._reconstruct(boxes, formats)
-            )
+            written = self._reconstruct(boxes, engine, hand, formats)
         print_files(written, self.out)
         print_summary(written.report)
 
@@ -102,26 +103,25 @@ class Reconstruct:
 
         check_rig(read_config(checkpoint), find_rig(self.folder, self.rig))
 
-    def _reconstruct(self, boxes: Path, formats: "frozenset[Format]") -> "Written":
+    def _reconstruct(
+        self,
+        boxes: Path,
+        engine: Literal["auto", "fit", "poem"],
+        hand: "HandModel | None",
+        formats: "frozenset[Format]",
+    ) -> "Written":
         from poem_jax.capture.pipeline import reconstruct
-        from poem_jax.capture.take import read_take
-
-        take = read_take(self.folder, self.rig, boxes, self.moments.timing())
-        say(f"{take.num_frames} frames; the first run on a machine compiles the model, once")
-        return reconstruct(
-            take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None, formats=formats
-        )
-
-    def _fit(self, boxes: Path, hand: "HandModel | None", formats: "frozenset[Format]") -> "Written":
-        from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
         from poem_jax.cli.fit import named_detector
 
         take = read_take(self.folder, self.rig, boxes, self.moments.timing())
-        say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
-        return fit(
+        what = "fit" if engine == "fit" else "model"
+        say(f"{take.num_frames} frames; the first run on a machine compiles the {what}, once")
+        return reconstruct(
             take,
             self.out,
+            engine=engine,
+            checkpoint=self.checkpoint,
             hand=hand,
             smooth=self.smooth,
             detector=named_detector(self.detector),

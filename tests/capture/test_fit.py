@@ -12,11 +12,11 @@ import pytest
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
-from poem_jax.capture.fit import _windows, hands_of
+from poem_jax.capture.fit import _windows, fit_hands, hands_of
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
-from poem_jax.capture.pipeline import fit
-from poem_jax.capture.take import Take, make_take, read_keypoint_take
+from poem_jax.capture.pipeline import fit, reconstruct
+from poem_jax.capture.take import Take, make_take, read_keypoint_take, read_take
 from poem_jax.cli import main
 from poem_jax.data.capture_folder import FramePaths
 from poem_jax.geometry.distortion import distort_pixels
@@ -27,6 +27,7 @@ from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO
 from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
+from tests.capture.stub_network import lost_network
 
 FRAMES, VIEWS, SIDES = 6, 4, ("right", "left")
 
@@ -277,8 +278,47 @@ def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
     assert "--formats must be a list of glb, bvh" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", "--checkpoint", "ckpt"]) == 2
     assert "a fit has no weights" in capsys.readouterr().err
-    assert main([*arguments, str(tmp_path / "out"), "--smooth"]) == 2
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--smooth"]) == 2
     assert "for --engine fit" in capsys.readouterr().err
+
+
+def test_of_both_engines_the_better_one_is_taken(files, fitted, tmp_path):
+    """The images show nothing, so that the network loses every hand; the fit does the take."""
+    keypoints, rig, images = files
+    take = read_take(images, rig, keypoints)
+    written = reconstruct(take, tmp_path / "out", network=lost_network(), progress=False)
+    choice = written.report["engine_choice"]
+    assert written.report["engine"] == choice["engine"] == "fit"
+    assert choice["by"] == "views left out"
+    assert choice["figures"]["fit"]["left_out_px"] < 3
+    assert choice["figures"]["poem"] == {"left_out_px": None, "hands_lost": 1.0}
+    assert written.report["timings_s"]["choose_engine"] > 0
+    np.testing.assert_allclose(
+        written.arrays["joints_world"],
+        fitted.arrays["joints_world"],
+        atol=1e-4,
+    )
+
+
+def test_a_key_point_that_is_off_is_not_borne_out(take):
+    """0 for the one that no other view agrees with, about 0.9 for the others, NaN for those unseen."""
+    keypoints = take.frames.hands.keypoints_px.copy()
+    keypoints[2, 0, 1, 8] += 40.0
+    keypoints[2, 0, 3, 4] = np.nan
+    confidence = np.ones(keypoints.shape[:-1])
+    confidence[2, 0, 0] = 0.5
+    changed_take = changed(take, keypoints_px=keypoints, confidence=confidence)
+    frames = list(fit_hands(changed_take.frames, changed_take, hands_of(default_hand())))
+    trust = frames[2].hands[0].joint_confidence
+    assert trust.shape == (VIEWS, 21)
+    assert trust[1, 8] == 0
+    assert np.isnan(trust[3, 4])
+    assert np.isnan(trust).sum() == 1
+    assert 0.7 < np.median(trust[2]) < 1
+    assert np.median(trust[0]) == pytest.approx(0.5 * np.median(trust[2]), abs=0.1)
+    everything = np.stack([hand.joint_confidence for frame in frames for hand in frame.hands])
+    assert np.nanmax(everything) <= 1
+    assert np.nanmin(everything) >= 0
 
 
 def test_key_points_and_rig_of_different_views_are_refused(files, take, tmp_path):
