@@ -1,4 +1,5 @@
-"""From a capture to hand meshes, as one line: read -> crop -> predict -> judge -> write.
+"""From a capture to hand meshes, as one line: read -> crop -> predict -> smooth -> judge ->
+write.
 
 Every stage is a function over a stream of frames (`frame.Frame`): it pulls one frame after the other from
 the stage before it, fills in its own fields, and hands it on; the last stage writes. No stage looks back, how
@@ -21,6 +22,7 @@ from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network, load_network, predict_hands
 from poem_jax.capture.read import read_images
 from poem_jax.capture.report import Clock
+from poem_jax.capture.smoothing import Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
@@ -38,6 +40,7 @@ def reconstruct(
     *,
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
+    smoothing: Smoothing = Smoothing(),
     meshes: bool | None = None,
     progress: bool = True,
 ) -> Written:
@@ -48,6 +51,7 @@ def reconstruct(
         out: Folder for the results; made when missing, files of the same name replaced.
         checkpoint: Model folder; None = the shipped weights. Not read when a network is given.
         network: A model in memory.
+        smoothing: What is done to the hands of a take from frame to frame.
         meshes: Write the meshes of every frame; None = if there is only one.
         progress: Show a progress bar when there are several frames.
 
@@ -62,7 +66,8 @@ def reconstruct(
     clock.lap("load_model")
     engine = functools.partial(by_network, network=network)
     about = {"engine": "network", "weights": network.origin, "image_hw": network.config.image_hw}
-    return _run(take, Path(out), engine, network.faces(), clock, about, meshes, progress)
+    smoother = Smoother(take, smoothing, network.hands())
+    return _run(take, Path(out), engine, smoother, network.faces(), clock, about, meshes, progress)
 
 
 def fit(
@@ -70,7 +75,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smooth: bool = False,
+    smoothing: Smoothing = Smoothing(),
     detector: str | None = None,
     meshes: bool | None = None,
     progress: bool = True,
@@ -84,7 +89,8 @@ def fit(
         take: From `read_keypoint_take`, or from `read_take` where the boxes come with key points.
         out: Folder for the results.
         hand: The user's hand in MANO's schema, of either side; None = the shipped hand.
-        smooth: Add a second pass that holds each hand's frames together.
+        smoothing: What is done to the hands of a take from frame to frame; offline adds a second pass of the
+            fit that holds each hand's frames together.
         detector: What found the key points, as for `fit_hands`; None = as their file names it.
         meshes: Write the meshes of every frame; None = if there is only one.
         progress: Show a progress bar when there are several frames.
@@ -99,11 +105,13 @@ def fit(
     check_folder_is_writable(out)
     clock = Clock()
     hands = hands_of(default_hand() if hand is None else hand)
-    engine = functools.partial(by_fit, hands=hands, smooth=smooth, detector=detector)
-    about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given", "smooth": smooth}
+    second_pass = smoothing.mode == "offline"
+    engine = functools.partial(by_fit, hands=hands, smooth=second_pass, detector=detector)
+    about = {"engine": "fit", "hand": "shipped hand" if hand is None else "given"}
     about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
-    return _run(take, Path(out), engine, faces, clock, about, meshes, progress)
+    smoother = Smoother(take, smoothing, hands)
+    return _run(take, Path(out), engine, smoother, faces, clock, about, meshes, progress)
 
 
 def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Network) -> Iterator[Frame]:
@@ -127,6 +135,7 @@ def _run(
     take: Take,
     out: Path,
     engine: Engine,
+    smoother: Smoother,
     faces: Mapping[str, Int[Array, "face 3"]],
     clock: Clock,
     about: Mapping[str, Any],
@@ -139,7 +148,8 @@ def _run(
     rig = take.rig._replace(T_cam_from_world=move_origin(take.rig.T_cam_from_world, origin_world))
     take = take._replace(rig=rig)
     frames = engine(take.frames, take, clock)
+    frames = clock.timed("smooth", smoother.smooth(frames))
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
     style = Style(faces, single if meshes is None else meshes, not single, origin_world)
-    return write_results(frames, take, out, style, clock, about)
+    return write_results(frames, take, out, style, clock, {**about, "smoothing": smoother.done})

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Literal
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.fit import hand_from
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Detector, Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
+from poem_jax.cli.options import Bridge, Detector, Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
 
 if TYPE_CHECKING:
+    from poem_jax.capture.smoothing import Smoothing
     from poem_jax.capture.write import Written
     from poem_jax.hand.model import HandModel
 
@@ -41,7 +42,11 @@ class Reconstruct:
     mano: OptionalFile = None
     """With --engine fit, as for `poem fit`."""
     smooth: Flag = False
-    """With --engine fit, as for `poem fit`."""
+    """As for `poem fit`."""
+    causal: Flag = False
+    """As for `poem fit`."""
+    bridge: Bridge = None
+    """As for `poem fit`."""
     detector: Detector = "file"
     """With --engine fit, as for `poem fit`."""
     meshes: Flag = False
@@ -56,10 +61,11 @@ class Reconstruct:
 
         if self.engine == "fit" and self.checkpoint is not None:
             raise ValueError("--checkpoint is for --engine network; a fit has no weights")
-        if self.engine == "network" and (self.mano is not None or self.smooth):
-            raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
+        if self.engine == "network" and self.mano is not None:
+            raise ValueError("--mano is for --engine fit; the network has its own hand")
         if self.engine == "network" and self.detector != "file":
             raise ValueError("--detector is for --engine fit; the network sees the images themselves")
+        smoothing = smoothing_of(self.smooth, self.causal, self.bridge)
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
         if self.checkpoint is not None and self.folder.is_dir():
@@ -67,7 +73,8 @@ class Reconstruct:
         hand = hand_from(self.mano)
         boxes = self.boxes or where_hands_are(self.folder, self.out, self.rig, self.max_hands, self.video)
         with tells_what_is_left(self.out):
-            written = self._fit(boxes, hand) if self.engine == "fit" else self._reconstruct(boxes)
+            fits = self.engine == "fit"
+            written = self._fit(boxes, hand, smoothing) if fits else self._reconstruct(boxes, smoothing)
         print_files(written, self.out)
         print_summary(written.report)
 
@@ -79,15 +86,17 @@ class Reconstruct:
 
         check_rig(read_config(checkpoint), find_rig(self.folder, self.rig))
 
-    def _reconstruct(self, boxes: Path) -> "Written":
+    def _reconstruct(self, boxes: Path, smoothing: "Smoothing") -> "Written":
         from poem_jax.capture.pipeline import reconstruct
         from poem_jax.capture.take import read_take
 
         take = read_take(self.folder, self.rig, boxes)
         say(f"{take.num_frames} frames; the first run on a machine compiles the model, once")
-        return reconstruct(take, self.out, checkpoint=self.checkpoint, meshes=self.meshes or None)
+        return reconstruct(
+            take, self.out, checkpoint=self.checkpoint, smoothing=smoothing, meshes=self.meshes or None
+        )
 
-    def _fit(self, boxes: Path, hand: "HandModel | None") -> "Written":
+    def _fit(self, boxes: Path, hand: "HandModel | None", smoothing: "Smoothing") -> "Written":
         from poem_jax.capture.pipeline import fit
         from poem_jax.capture.take import read_take
         from poem_jax.cli.fit import named_detector
@@ -98,7 +107,7 @@ class Reconstruct:
             take,
             self.out,
             hand=hand,
-            smooth=self.smooth,
+            smoothing=smoothing,
             detector=named_detector(self.detector),
             meshes=self.meshes or None,
         )
