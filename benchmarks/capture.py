@@ -7,6 +7,7 @@ A row is a function that prints what it measured; `ROWS` lists them.
     fit         key points given, engine fit: 4 cameras, two hands, the whole way from a take to its files,
                 without images, so that no overlay is drawn
     memory      memory of a search, then of a fit, after 200 and after 2,000 frames of a synthetic take
+    smoothing   how much hands tremble, and how late they are, before they are smoothed and after
 """
 
 import argparse
@@ -20,6 +21,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from capture_smoothing import smoothing
 
 from poem_jax.calibration.rig_json import read_rig, write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
@@ -202,7 +204,12 @@ def planted(rig: Rig, turns: Iterator[int]) -> Callable[..., list[list[DetectedH
     return detect
 
 
-ROWS: dict[str, Callable[[Path], None]] = {"detection": detection, "fit": fit_rate, "memory": memory}
+ROWS: dict[str, Callable[[Path], None]] = {
+    "detection": detection,
+    "fit": fit_rate,
+    "memory": memory,
+    "smoothing": lambda _: smoothing(),
+}
 """Every row takes the folder of real data."""
 
 

@@ -38,8 +38,8 @@ class Engine(NamedTuple):
     """The same on trial: nothing is judged, and no image read that it does not need."""
     faces: Mapping[str, Int[Array, "face 3"]]
     """Triangles by side."""
-    hands: Mapping[str, HandModel] | None
-    """The hand models by side that its meshes are of; None = not known."""
+    hands: Hands | None
+    """The hand models that its meshes are of; None = not known."""
     about: Mapping[str, Any]
     """What the report says of it."""
 
@@ -51,6 +51,7 @@ class EngineOptions(NamedTuple):
     network: Network | None = None
     hand: HandModel | None = None
     smooth: bool = False
+    """Of the fit: a second pass that holds each hand's frames together."""
     detector: str | None = None
 
 
@@ -94,8 +95,8 @@ def _check_options(name: EngineName | str, options: EngineOptions) -> None:
         raise ValueError(f"`engine` must be one of {', '.join(get_args(EngineName))}; got {name!r}")
     if name == "fit" and (options.checkpoint is not None or options.network is not None):
         raise ValueError("`checkpoint` and `network` are for the engine poem; a fit has no weights")
-    if name == "poem" and (options.hand is not None or options.smooth or options.detector is not None):
-        raise ValueError("`hand`, `smooth` and `detector` are for the engine fit; poem has its own hand")
+    if name == "poem" and (options.hand is not None or options.detector is not None):
+        raise ValueError("`hand` and `detector` are for the engine fit; poem has its own hand")
 
 
 def _only_one(keypoints: bool, images: bool, anything: bool) -> EngineChoice | None:
@@ -129,12 +130,12 @@ def fit_engine(take: Take, options: EngineOptions) -> Engine:
 
     hands = hands_of(default_hand() if options.hand is None else options.hand)
     detector = options.detector
-    about = {"hand": "shipped hand" if options.hand is None else "given", "smooth": options.smooth}
+    about = {"hand": "shipped hand" if options.hand is None else "given"}
     about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
     run = functools.partial(by_fit, hands=hands, smooth=options.smooth, detector=detector)
     find = functools.partial(try_fit, hands=hands, detector=detector)
-    return Engine(run, find, faces, {"right": hands.right, "left": hands.left}, about)
+    return Engine(run, find, faces, hands, about)
 
 
 def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Network) -> Iterator[Frame]:

@@ -1,4 +1,5 @@
-"""From a capture to hand meshes, as one line: read -> crop -> predict -> judge -> write.
+"""From a capture to hand meshes, as one line: read -> crop -> predict -> smooth -> judge ->
+write.
 
 Every stage is a function over a stream of frames (`frame.Frame`): it pulls one frame after the other from
 the stage before it, fills in its own fields, and hands it on; the last stage writes. No stage looks back, how
@@ -15,6 +16,7 @@ from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network
 from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
 from poem_jax.capture.report import Clock
+from poem_jax.capture.smoothing import Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
@@ -30,7 +32,7 @@ def reconstruct(
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
     hand: HandModel | None = None,
-    smooth: bool = False,
+    smoothing: Smoothing = Smoothing(),
     detector: str | None = None,
     meshes: bool | None = None,
     formats: frozenset[Format] = DEFAULT_FORMATS,
@@ -50,7 +52,8 @@ def reconstruct(
         checkpoint: Of poem: model folder; None = the shipped weights. Not read when a network is given.
         network: Of poem: a model in memory.
         hand: Of the fit: the user's hand in MANO's schema, of either side; None = the shipped hand.
-        smooth: Of the fit: add a second pass that holds each hand's frames together.
+        smoothing: What is done to the hands of a take from frame to frame; offline adds a second pass of the
+            fit that holds each hand's frames together.
         detector: Of the fit: what found the key points, as for `fit_hands`; None = as their file names it.
         meshes: Write the meshes of every frame; None = if there is only one.
         formats: What to write beyond arrays, page, report and overlays.
@@ -68,17 +71,20 @@ def reconstruct(
     # A world whose origin is near the cameras.
     origin_world = distant_origin(take.rig.T_cam_from_world)
     rig = take.rig._replace(T_cam_from_world=move_origin(take.rig.T_cam_from_world, origin_world))
-    options = EngineOptions(checkpoint, network, hand, smooth, detector)
+    options = EngineOptions(checkpoint, network, hand, smoothing.mode == "offline", detector)
     chosen = engine_for(take._replace(rig=rig), engine, options)
     clock.lap("choose_engine" if chosen.choice.figures else "load_model")
     take = chosen.take
     frames = chosen.engine.run(take.frames, take, clock)
+    smoother = Smoother(take, smoothing, chosen.engine.hands)
+    frames = clock.timed("smooth", smoother.smooth(frames))
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
     meshes = single if meshes is None else meshes
-    style = Style(chosen.engine.faces, meshes, not single, origin_world, chosen.engine.hands, formats)
+    sides = chosen.engine.hands and chosen.engine.hands.by_side()
+    style = Style(chosen.engine.faces, meshes, not single, origin_world, sides, formats)
     about = {"engine": chosen.choice.engine, **chosen.engine.about}
-    about |= {"engine_choice": chosen.choice.as_report()}
+    about |= {"engine_choice": chosen.choice.as_report(), "smoothing": smoother.done}
     return write_results(frames, take, Path(out), style, clock, about)
 
 
@@ -87,7 +93,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smooth: bool = False,
+    smoothing: Smoothing = Smoothing(),
     detector: str | None = None,
     meshes: bool | None = None,
     formats: frozenset[Format] = DEFAULT_FORMATS,
@@ -102,7 +108,7 @@ def fit(
         out,
         engine="fit",
         hand=hand,
-        smooth=smooth,
+        smoothing=smoothing,
         detector=detector,
         meshes=meshes,
         formats=formats,

@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from poem_jax.cli.detect import where_hands_are
-from poem_jax.cli.fit import hand_from
+from poem_jax.cli.fit import hand_from, smoothing_of
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import (
+    Bridge,
     Detector,
     Flag,
     Folder,
@@ -21,6 +22,7 @@ from poem_jax.cli.options import (
 
 if TYPE_CHECKING:
     from poem_jax.capture.outputs.formats import Format
+    from poem_jax.capture.smoothing import Smoothing
     from poem_jax.capture.write import Written
     from poem_jax.hand.model import HandModel
 
@@ -56,7 +58,11 @@ class Reconstruct:
     mano: OptionalFile = None
     """Of the fit, as for `poem fit`."""
     smooth: Flag = False
-    """Of the fit, as for `poem fit`."""
+    """As for `poem fit`."""
+    causal: Flag = False
+    """As for `poem fit`."""
+    bridge: Bridge = None
+    """As for `poem fit`."""
     detector: Detector = "file"
     """Of the fit, as for `poem fit`."""
     meshes: Flag = False
@@ -77,11 +83,12 @@ class Reconstruct:
         engine = "poem" if self.engine == "network" else self.engine
         if engine == "fit" and self.checkpoint is not None:
             raise ValueError("--checkpoint is for --engine poem; a fit has no weights")
-        if engine == "poem" and (self.mano is not None or self.smooth):
-            raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
+        if engine == "poem" and self.mano is not None:
+            raise ValueError("--mano is for --engine fit; the network has its own hand")
         if engine == "poem" and self.detector != "file":
             raise ValueError("--detector is for --engine fit; the network sees the images themselves")
         formats = formats_of(self.formats)
+        smoothing = smoothing_of(self.smooth, self.causal, self.bridge)
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
         if self.checkpoint is not None and self.folder.is_dir():
@@ -91,7 +98,7 @@ class Reconstruct:
             self.folder, self.out, self.rig, self.max_hands, self.video, self.moments
         )
         with tells_what_is_left(self.out):
-            written = self._reconstruct(boxes, engine, hand, formats)
+            written = self._reconstruct(boxes, engine, hand, smoothing, formats)
         print_files(written, self.out)
         print_summary(written.report)
 
@@ -108,6 +115,7 @@ class Reconstruct:
         boxes: Path,
         engine: Literal["auto", "fit", "poem"],
         hand: "HandModel | None",
+        smoothing: "Smoothing",
         formats: "frozenset[Format]",
     ) -> "Written":
         from poem_jax.capture.pipeline import reconstruct
@@ -123,7 +131,7 @@ class Reconstruct:
             engine=engine,
             checkpoint=self.checkpoint,
             hand=hand,
-            smooth=self.smooth,
+            smoothing=smoothing,
             detector=named_detector(self.detector),
             meshes=self.meshes or None,
             formats=formats,
