@@ -42,7 +42,7 @@ def meeting_points(
     """
     seen = np.isfinite(keypoints_px).all(-1)
     rays = normalised_from_pixels(rig.K, np.where(seen[..., None], keypoints_px, 0.0))
-    T = rig.T_cam_from_world[:, None, None]
+    T = rig.T_cam_from_world[:, None]
     rows = rays[..., None] * T[..., 2:3, :] - T[..., :2, :]
     rows = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-300) * seen[..., None, None]
     eigenvalues, vectors = np.linalg.eigh(np.einsum("hvjri,hvjrk->hjik", rows, rows))

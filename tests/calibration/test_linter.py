@@ -6,12 +6,11 @@ Three good rigs: two real ones of four cameras (skipped without the reference ma
 import numpy as np
 import pytest
 
-from poem_jax.calibration.rig_json import read_rig
 from poem_jax.capture.calibration_check import check_calibration
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.distortion import distort_pixels
 from poem_jax.geometry.rig import HALF_PIXEL, Rig
-from poem_jax.geometry.transforms import rotation_from_axis_angle
+from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
 from poem_jax.hand.template import default_hand
 from poem_jax.synthetic.keypoint_takes import IMAGE_WH, draw_keypoint_take
 from tests.calibration.planted_faults import FAULTS, late, words
@@ -40,6 +39,16 @@ def moving_take(tau_frames=(0.0, 0.0, 0.0, 0.0), seed=3, frames=FRAMES, noise_px
     return rig, uv + rng.normal(0, noise_px, uv.shape)
 
 
+def rig_of(stored):
+    """The rig of a pseudo ground truth, with the house's pixels."""
+    count = len(stored["K"])
+    K = stored["K"].astype(float)
+    K[:, :2, 2] += HALF_PIXEL
+    T = rigid(stored["R_world2cam"].astype(float), stored["t_world2cam"].astype(float).reshape(count, 3))
+    size = np.broadcast_to(stored["image_size_wh"], (count, 2)).astype(int)
+    return Rig(tuple(f"cam_{i}" for i in range(count)), size, K, stored["dist"].astype(float), T)
+
+
 def real_take(folder):
     """A rig and its key points, (frame, hand, view, 21, 2), hands left before right."""
     stored = np.load(folder / "pseudo_gt.npz")
@@ -47,7 +56,7 @@ def real_take(folder):
     uv = np.full((len(frames), 2, stored["keypoints_2d"].shape[1], 21, 2), np.nan)
     for frame, side, points in zip(stored["frame"], stored["hand_side"], stored["keypoints_2d"], strict=True):
         uv[np.flatnonzero(frames == frame)[0], sides.index(str(side))] = points + HALF_PIXEL
-    return read_rig(folder / "calibration" / "rig.json"), uv
+    return rig_of(stored), uv
 
 
 REAL = ("caliscope_4cam_hands", "caliscope_4cam_board")
@@ -131,5 +140,5 @@ def test_the_bad_track_is_flagged(shared_dir):
     folder = shared_dir / "data" / "caliscope_4cam_track"
     stored = np.load(next(folder.glob("*.npz")))
     uv = np.moveaxis(stored["keypoints_2d"].astype(float), 1, 2) + HALF_PIXEL
-    found = check_calibration(read_rig(folder / "calibration" / "rig.json"), uv)
+    found = check_calibration(rig_of(stored), uv)
     assert found
