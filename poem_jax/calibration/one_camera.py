@@ -84,7 +84,8 @@ def explain_camera(
     given = _error_px(scene, near.K[view], near.T_cam_from_world[view], scene.ideal_px)
     turned, moved = _turned(scene), _moved(scene)
     floor = _error_px(scene, near.K[view], moved, scene.ideal_px)
-    known = _known_mistake(rig, scene, raw, max(_KNOWN_IS_ENOUGH * floor, 0.5 * limit_px))
+    most = float(np.clip(_KNOWN_IS_ENOUGH * floor, 0.5 * limit_px, 2 * limit_px))
+    known = _known_mistake(rig, scene, raw, most)
     if known is not None:
         return LoneCamera(known, rig, True)
     if floor > _MIN_GAIN * given or floor > 2 * limit_px:

@@ -31,7 +31,7 @@ def moving_take(tau_frames=(0.0, 0.0, 0.0, 0.0), seed=3, frames=FRAMES, noise_px
     uv = np.empty((frames, 1, 4, 21, 2))
     for view, tau in enumerate(tau_frames):
         t = (np.arange(frames) + tau)[:, None]
-        place = 0.07 * np.sin(t * [0.31, 0.23, 0.41] + [0, 1, 2])
+        place = 0.2 * np.sin(t * [0.31, 0.23, 0.41] + [0, 1, 2])
         R = rotation_from_axis_angle(0.6 * np.sin(t * [0.2, 0.13, 0.17]))
         joints = np.einsum("fij,pj->fpi", R, hand) + place[:, None]
         ideal, _ = project(rig.K[view], rig.T_cam_from_world[view], joints)
