@@ -36,7 +36,7 @@ _CLEAR_ERROR = 0.6
 """So much of the next cause's median error, at most, may remain with the best cause."""
 _CLEAR_MISFIT = 0.6
 """So much of the misfit of the given order, at most, may remain in the order that is named."""
-_MAX_HANDS = 24
+_MAX_HANDS = 16
 _OPENPOSE = "(wrist, then thumb to little finger, each from its base to its tip)"
 _UNITS = {"millimetres": 1e3, "centimetres": 1e2, "inches": 1 / 0.0254, "feet": 1 / 0.3048}
 
@@ -82,10 +82,12 @@ def explain(
     """
     every = np.asarray(keypoints_px, np.float64)
     keypoints_px = _few(every)
-    given = _try(None, rig, keypoints_px)
+    ideal_px = ideal_keypoints(rig, keypoints_px)
+    given = _try(None, rig, keypoints_px, ideal_px)
     trial, found = given, []
     if given.agreeing < MIN_AGREEING:
-        likely = _likely(given, [_try(h, rig, keypoints_px) for h in HYPOTHESES], size, joint_orders)
+        trials = [_try(mistake, rig, keypoints_px, ideal_px) for mistake in HYPOTHESES]
+        likely = _likely(given, trials, size, joint_orders)
         if len(likely) != 1:
             found = judge_views(rig, every, time_s=time_s)
             return [f for f in found if f.name not in UNEXPLAINED] or [_unexplained(given, likely)]
@@ -120,11 +122,13 @@ def _likely(
     return [trial for trial in hands if _CLEAR_ERROR * trial.error_px <= least]
 
 
-def _try(hypothesis: Hypothesis | None, rig: Rig, keypoints_px: Array) -> _Trial:
-    """Triangulate the hands with a mistake undone."""
+def _try(hypothesis: Hypothesis | None, rig: Rig, keypoints_px: Array, given_ideal_px: Array) -> _Trial:
+    """Triangulate the hands with a mistake undone, which leaves most often the undistorted pixels as given."""
+    given, given_px = rig, keypoints_px
     if hypothesis is not None:
         rig, keypoints_px = hypothesis.undo(rig, keypoints_px)
-    ideal = ideal_keypoints(rig, keypoints_px)
+    same = rig.K is given.K and rig.dist is given.dist and keypoints_px is given_px
+    ideal = given_ideal_px if same else ideal_keypoints(rig, keypoints_px)
     ideal = ideal.reshape(-1, *ideal.shape[2:])
     near, extent = near_rig(rig)
     points, valid = meeting_points(near, ideal)

@@ -19,10 +19,10 @@ MIN_FRAMES = 4
 MAX_FRAMES_OFF = 8.0
 """Offsets beyond it are not looked for."""
 
-_STEP = 0.25
+_STEP = 0.5
 """Frames between the offsets that are tried first."""
 _SWEEPS = 4
-_MAX_POINTS = 2500
+_MAX_POINTS = 1000
 """Of a camera, as many as the medians need."""
 _LONGEST_RUN = 1000
 """Frames that are looked at, one after the other."""
@@ -55,13 +55,16 @@ def find_offsets(
     rig: Rig,
     keypoints_px: Float[Array, "frame hand view joint 2"],
     time_s: Float[Array, " frame"] | None = None,
+    *,
+    view: int | None = None,
 ) -> TimeOffsets | None:
-    """Find the offsets of all cameras.
+    """Find the offsets of all cameras, or of the one that alone disagrees.
 
     Args:
         rig: The cameras.
         keypoints_px: In pixels of the raw images, frames in the order of time; NaN = unseen.
         time_s: When each frame was taken, seconds; None = the frames are evenly spaced.
+        view: The camera that may be off; None = any may.
 
     Returns: None where there are too few frames, or no pair of cameras can be judged.
     """
@@ -75,7 +78,7 @@ def find_offsets(
     given = _pair_errors(moments, F, nothing)
     if not np.isfinite(given).any():
         return None
-    offsets = _descend(moments, F, nothing)
+    offsets = _descend(moments, F, nothing, view)
     offsets -= np.median(offsets)
     found = _pair_errors(moments, F, offsets)
     if not np.isfinite(found).any():
@@ -113,7 +116,7 @@ def _most_seen(keypoints_px: Array) -> slice:
     return slice(start, start + _LONGEST_RUN)
 
 
-def _descend(moments: _Moments, F: dict, offsets: Array) -> Float[Array, " view"]:
+def _descend(moments: _Moments, F: dict, offsets: Array, only: int | None) -> Float[Array, " view"]:
     """Find each camera's offset in turn, the others' held, from every start in the first sweep."""
     offsets = offsets.copy()
     reach = min(MAX_FRAMES_OFF, (len(moments.times) - 1) / 3)
@@ -123,9 +126,9 @@ def _descend(moments: _Moments, F: dict, offsets: Array) -> Float[Array, " view"
         # The camera that is worst off moves first; those that it alone spoils then stay.
         errors = _pair_errors(moments, F, offsets)
         order = np.argsort(-np.nan_to_num(_medians(errors)), kind="stable")
-        for view in order:
+        for view in order if only is None else [only]:
             offsets[view] = _best(moments, F, offsets, int(view), coarse)
-        if np.abs(offsets - before).max() < 0.02:
+        if only is not None or np.abs(offsets - before).max() < 0.02:
             break
     return offsets
 

@@ -98,7 +98,7 @@ def judge_views(
     cause = None if view is None else explain_camera(rig, keypoints_px, view, limit)
     if cause is not None and cause.known:
         return [cause.finding]
-    late = _late(rig, every, time_s, cause, limit)
+    late = _late(rig, every, time_s, view, cause, limit)
     if late:
         return late
     if view is None:
@@ -107,12 +107,17 @@ def judge_views(
 
 
 def _late(
-    rig: Rig, keypoints_px: Array, time_s: Array | None, cause: LoneCamera | None, limit: float
+    rig: Rig,
+    keypoints_px: Array,
+    time_s: Array | None,
+    view: int | None,
+    cause: LoneCamera | None,
+    limit: float,
 ) -> list[Finding]:
     """Name cameras that took their frames earlier or later, where this explains about all."""
     if rig.num_views > MAX_EXCHANGED_VIEWS:
         return []
-    offsets = find_offsets(rig, keypoints_px, time_s)
+    offsets = find_offsets(rig, keypoints_px, time_s, view=view)
     if offsets is None or offsets.error_px > limit or np.abs(offsets.frames).max() < LATE_FRAMES:
         return []
     if cause is not None:
