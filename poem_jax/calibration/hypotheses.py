@@ -123,7 +123,7 @@ def _likely(
 
 
 def _try(hypothesis: Hypothesis | None, rig: Rig, keypoints_px: Array, given_ideal_px: Array) -> _Trial:
-    """Triangulate the hands with a mistake undone, which leaves most often the undistorted pixels as given."""
+    """Triangulate the hands with a mistake undone; most leave the undistorted pixels as given."""
     given, given_px = rig, keypoints_px
     if hypothesis is not None:
         rig, keypoints_px = hypothesis.undo(rig, keypoints_px)

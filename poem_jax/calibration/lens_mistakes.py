@@ -23,8 +23,8 @@ MIN_HANDS = 6
 _CAP_SHARE = 0.04
 """Of the images' diagonal, beyond which a distance counts for no more."""
 _REMAINS = 0.8
-"""So much of the mean distance, at most, may remain with the lens mended. On four captures a wrong lens leaves
-0.45 to 0.75, and terms estimated where there are none to be found 0.9 and more."""
+"""So much of the mean distance, at most, may remain with the lens mended. On four captures undoing a mistake
+leaves 0.4 to 0.65, and terms estimated where there are none 0.9 and more."""
 _HANDS_THAT_GAIN = 0.8
 """Share of the hands that must fit better: a few at an edge may do so by chance."""
 _RANGE = (-0.6, 0.6)

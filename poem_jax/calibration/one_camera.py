@@ -1,4 +1,4 @@
-"""What is wrong with the one camera that stands alone: a known mistake, or it was moved since the calibration.
+"""What is wrong with the one camera that stands alone: a known mistake, or it was moved.
 
 The others say where the joints are; the camera must show them there. A known mistake has nothing to be
 estimated, while a new place of the camera has six numbers and explains nearly everything: so the mistake is
@@ -146,10 +146,13 @@ def _moved_finding(rig: Rig, T: Array, view: int, given: float, found: float, tu
 def _turned(scene: _Scene) -> Float[Array, "4 4"]:
     """Return the extrinsics that fit best of those at the camera's place."""
     T = scene.rig.T_cam_from_world[scene.view]
-    found = least_squares(
-        lambda x: _residuals(scene, _changed(T, np.concatenate([x, np.zeros(3)]))), np.zeros(3), loss="soft_l1"
-    )
-    return _changed(T, np.concatenate([found.x, np.zeros(3)]))
+    nothing = np.zeros(3)
+
+    def residuals(turn: Array) -> Array:
+        return _residuals(scene, _changed(T, np.concatenate([turn, nothing])))
+
+    found = least_squares(residuals, nothing, loss="soft_l1")
+    return _changed(T, np.concatenate([found.x, nothing]))
 
 
 def _moved(scene: _Scene) -> Float[Array, "4 4"]:

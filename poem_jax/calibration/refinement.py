@@ -60,7 +60,7 @@ class _Problem(NamedTuple):
 
 
 class _Normal(NamedTuple):
-    """The normal equations [[A, C], [C^T, B]] of what is shared and of each hand's joints, filled in place."""
+    """The normal equations [[A, C], [C^T, B]] of what is shared and each hand's joints, filled in place."""
 
     A: Float[Array, "shared shared"]
     a: Float[Array, " shared"]
@@ -190,7 +190,7 @@ def _add_pixels(normal: _Normal, problem: _Problem, state: _State, pixels: Array
     W_point = weight[..., None, None] * J_point
     of_point = np.einsum("hvjri,hvjrk->jhik", W_point, J_point, optimize=True)
     normal.B[:, np.arange(joints), :, np.arange(joints)] += of_point
-    normal.b += np.einsum("hvjri,hvjr->hji", W_point, pixels, optimize=True)
+    normal.b[:] += np.einsum("hvjri,hvjr->hji", W_point, pixels, optimize=True)
 
 
 def _add_bones(normal: _Normal, problem: _Problem, state: _State, bones: Array) -> None:
@@ -284,7 +284,5 @@ def _as_given(T_given: Array, T: Array) -> Float[Array, "view 4 4"]:
     # Each camera's distance, not its square: the one that moved has no say.
     for _ in range(30):
         weight = 1 / np.sqrt(np.maximum(off(x), 0.05))
-        x = least_squares(
-            lambda x, w=weight: (w[:, None] * _moves(T_given, moved(x)) / _ALIGN).ravel(), x
-        ).x
+        x = least_squares(lambda x, w=weight: (w[:, None] * _moves(T_given, moved(x)) / _ALIGN).ravel(), x).x
     return moved(x)

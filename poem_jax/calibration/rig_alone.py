@@ -1,4 +1,4 @@
-"""What a rig shows by itself, without any key points: cameras that stand twice, that look at nothing together,
+"""What a rig shows by itself, without any key points: cameras that stand twice or look at nothing together,
 intrinsics of another size, a unit by which no room is so large.
 
 All but cameras that stand twice are doubts: key points that fit together take them back.
@@ -63,8 +63,8 @@ def _directions(rig: Rig) -> list[Finding]:
     nothing = np.full((1, 1, rig.num_views, 1, 2), np.nan)
     better = [m for m in HYPOTHESES if _sees_together(m.undo(rig, nothing)[0]).all()]
     evidence = (
-        "the cameras do not look at one place: the point nearest to all their optical axes is not in the image "
-        f"of {', '.join(blind)}"
+        "the cameras do not look at one place: the point nearest to all their optical axes is not in the "
+        f"image of {', '.join(blind)}"
     )
     if better:
         evidence += f"; it would be if {better[0].cause}"
@@ -79,22 +79,22 @@ def _intrinsics(rig: Rig) -> list[Finding]:
         place = np.array([cx / width, cy / height])
         field = np.degrees(2 * np.arctan(0.5 * width / fx))
         if (place < _CENTRAL[0]).any() or (place > _CENTRAL[1]).any():
-            found.append(
-                Finding(
-                    "principal point",
-                    f"the principal point of camera '{name}', ({cx:.0f}, {cy:.0f}), is far from the middle of its "
-                    f"{width} x {height} image",
-                    "scale `K` to the size of the images, correct cx and cy, or leave it so if the images are cut "
-                    "out of larger ones",
-                )
+            evidence = (
+                f"the principal point of camera '{name}', ({cx:.0f}, {cy:.0f}), is far from the middle of "
+                f"its {width} x {height} image"
             )
+            fix = (
+                "scale `K` to the size of the images, correct cx and cy, or leave it so if the images are "
+                "cut out of larger ones"
+            )
+            found.append(Finding("principal point", evidence, fix))
         if max(fx / fy, fy / fx) > _MAX_RATIO:
             evidence = f"the pixels of camera '{name}' are not square: fx = {fx:.0f}, fy = {fy:.0f}"
             found.append(Finding("focal lengths", evidence, "check fx and fy of `K`"))
         elif not _FIELDS_DEG[0] < field < _FIELDS_DEG[1]:
             evidence = (
-                f"camera '{name}' sees {field:.0f} degrees over its {width} pixels (fx = {fx:.0f}), which no pinhole "
-                "lens does"
+                f"camera '{name}' sees {field:.0f} degrees over its {width} pixels (fx = {fx:.0f}), which no "
+                "pinhole lens does"
             )
             found.append(Finding("focal lengths", evidence, "check fx of `K`, and that it is in pixels"))
     return found
@@ -108,13 +108,13 @@ def _lengths(rig: Rig) -> list[Finding]:
     widest, nearest = float(max(pairs)), int(np.argmin(pairs))
     if not _SMALLEST_M < widest < _LARGEST_M:
         evidence = f"the cameras stand up to {widest:.3g} m apart, which is not the size of a rig for hands"
-        fix = "check the unit: in millimetres it would be {:.3g} m".format(widest / 1000)
+        fix = f"check the unit: in millimetres it would be {widest / 1000:.3g} m"
         return [Finding("unit of the rig", evidence, fix if widest > _LARGEST_M else "check the unit")]
     a, b = list(combinations(range(rig.num_views), 2))[nearest]
     if pairs[nearest] < 0.01 * widest and not _duplicates(rig):
         evidence = (
-            f"cameras '{rig.names[a]}' and '{rig.names[b]}' stand {1000 * pairs[nearest]:.1f} mm apart, so that "
-            "the two measure no depth"
+            f"cameras '{rig.names[a]}' and '{rig.names[b]}' stand {1000 * pairs[nearest]:.1f} mm apart, so "
+            "that the two measure no depth"
         )
         return [Finding("no baseline", evidence, "move one of them, or check `t`")]
     return []

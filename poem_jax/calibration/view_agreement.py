@@ -121,7 +121,9 @@ def _late(
     if offsets is None or offsets.error_px > limit or np.abs(offsets.frames).max() < LATE_FRAMES:
         return []
     if cause is not None:
-        moved = _worst(epipolar_distances_px(cause.rig, ideal_keypoints(cause.rig, spread_frames(keypoints_px))))
+        moved = _worst(
+            epipolar_distances_px(cause.rig, ideal_keypoints(cause.rig, spread_frames(keypoints_px)))
+        )
         if offsets.error_px > _TIME_IS_ENOUGH * moved:
             return []
     return [late_cameras(rig, offsets, time_s)]

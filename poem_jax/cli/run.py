@@ -22,7 +22,17 @@ from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop
 from poem_jax.cli.train import Train
 
 Command = (
-    Demo | Reconstruct | Fit | Detect | Calibration | Inspect | Train | Eval | ImportTorch | ExportTorch | Pack
+    Demo
+    | Reconstruct
+    | Fit
+    | Detect
+    | Calibration
+    | Inspect
+    | Train
+    | Eval
+    | ImportTorch
+    | ExportTorch
+    | Pack
 )
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]

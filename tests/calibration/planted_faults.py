@@ -18,7 +18,6 @@ def _pixels(change):
     return lambda rig, uv: (rig, change(uv.copy(), rig.size_wh[:, None].astype(float)))
 
 
-
 def _unit(factor):
     def change(T):
         T[:, :3, 3] *= factor
@@ -147,7 +146,11 @@ FAULTS = {
     "K of half the size": (_K(slice(None), 0.5), "pixels of another resolution", "2 times as large"),
     "K of one camera of half the size": (_K(1, 0.5), "pixels of another resolution", "camera '{1}' alone"),
     "cx and cy exchanged": (_exchange("centre", None), "principal point exchanged", "cx and cy"),
-    "cx and cy of one camera exchanged": (_exchange("centre", [3]), "principal point exchanged", "'{3}' alone"),
+    "cx and cy of one camera exchanged": (
+        _exchange("centre", [3]),
+        "principal point exchanged",
+        "'{3}' alone",
+    ),
     "cameras swapped": (_swapped, "cameras exchanged", "'{0}' is of '{1}'"),
     "duplicate cameras": (_duplicate, "duplicate cameras", "'{0}' and '{1}'"),
     "one image copied": (_copied, "copied images", "'{0}' and '{1}'"),
@@ -172,7 +175,11 @@ FAULTS = {
         "no terms of the lens",
     ),
     "lens used twice": (_undistorted, "lens used twice", "undistorted images already"),
-    "sign of the lens": (lambda rig, uv: (rig._replace(dist=-rig.dist), uv), "sign of the lens", "wrong sign"),
+    "sign of the lens": (
+        lambda rig, uv: (rig._replace(dist=-rig.dist), uv),
+        "sign of the lens",
+        "wrong sign",
+    ),
     "one camera late": (late(1), "time offset", "'{2}' +1.0"),
 }
 """How it is planted, the name of the finding, and what its text holds ({0} = name of the first camera)."""

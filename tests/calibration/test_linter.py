@@ -13,7 +13,7 @@ from poem_jax.geometry.rig import HALF_PIXEL, Rig
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
 from poem_jax.hand.template import default_hand
 from poem_jax.synthetic.keypoint_takes import IMAGE_WH, draw_keypoint_take
-from tests.calibration.planted_faults import FAULTS, late, words
+from tests.calibration.planted_faults import FAULTS, words
 
 NOISE_PX = 0.8
 FRAMES = 24

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.rig_refinement import refine_rig
-from poem_jax.geometry.transforms import axis_angle_from_rotation, invert_rigid, rigid, rotation_from_axis_angle
+from poem_jax.geometry.transforms import (
+    axis_angle_from_rotation,
+    invert_rigid,
+    rigid,
+    rotation_from_axis_angle,
+)
 from tests.calibration.test_linter import moving_take
 
 
@@ -30,7 +35,7 @@ def off(rig, other):
 
 @pytest.fixture(scope="module")
 def take():
-    return moving_take(frames=36, noise_px=0.5)
+    return moving_take(frames=90, noise_px=0.5)
 
 
 @pytest.mark.parametrize("view", [0, 2])
@@ -75,7 +80,7 @@ def test_outliers_do_not_spoil_it(take):
 
 
 def test_offsets_in_time_are_found_with_the_places():
-    rig, uv = moving_take((0.0, 0.0, 0.6, 0.0), frames=36, noise_px=0.5)
+    rig, uv = moving_take((0.0, 0.0, 0.6, 0.0), frames=90, noise_px=0.5)
     refined = refine_rig(touched(rig, 1, 1.0, 0.010), uv, offsets=True)
     assert np.abs(refined.frames_late - [0, 0, 0.6, 0]).max() < 0.1
     degrees, metres = off(refined.rig, rig)
