@@ -50,8 +50,8 @@ def late_cameras(rig: Rig, offsets: TimeOffsets, time_s: Float[Array, " frame"] 
     return Finding(
         TIME_OFFSET,
         f"the cameras' frames are not of one moment: {', '.join(moments)} after the others' frames of the "
-        f"same number (minus: before); so the key points lie {offsets.error_px:.1f} px off each other's epipolar "
-        f"lines, as given {offsets.given_px:.1f} px (worst pair, median)",
+        f"same number (minus: before); so the key points lie {offsets.error_px:.1f} px off each other's "
+        f"epipolar lines, as given {offsets.given_px:.1f} px (worst pair, median)",
         "shift these cameras' frames by as much, or record with cameras that are triggered together",
         fatal=False,
     )

@@ -78,8 +78,8 @@ def check_files(
     pairs = epipolar_distances_px(rig, ideal_keypoints(rig, hands[:_MOST_FRAMES]))
     worst = float(np.nanmax(pairs)) if np.isfinite(pairs).any() else np.nan
     summary = (
-        f"nothing is wrong: the key points of {len(hands)} frames lie at most {worst:.1f} px off each other's "
-        "epipolar lines (worst pair of cameras, median)"
+        f"nothing is wrong: the key points of {len(hands)} frames lie at most {worst:.1f} px off each "
+        "other's epipolar lines (worst pair of cameras, median)"
     )
     return _written(CheckReport(findings, summary), rig, hands, footage, out)
 

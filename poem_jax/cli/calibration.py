@@ -142,7 +142,8 @@ class Refine:
         if not refined.helps:
             raise ValueError(
                 f"the refined rig is not written: frames that were held out fit no better by it "
-                f"({_change(refined.held_out_mean_px)} px, expected {100 * MIN_GAIN:.0f} % less); keep {self.rig}"
+                f"({_change(refined.held_out_mean_px)} px, expected {100 * MIN_GAIN:.0f} % less); keep "
+                f"{self.rig}"
             )
         write_rig(self.out, refined.rig)
         print(f"written to {self.out}")
@@ -164,11 +165,12 @@ def _change(before_after: "tuple[float, float]") -> str:
 class Calibration:
     """Check, convert and refine calibrations of cameras."""
 
-    action: (
+    action: Annotated[
         Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Convert, tyro.conf.subcommand("convert")]
-        | Annotated[Refine, tyro.conf.subcommand("refine")]
-    )
+        | Annotated[Refine, tyro.conf.subcommand("refine")],
+        tyro.conf.arg(name=""),
+    ]
 
     @property
     def debug(self) -> bool:

@@ -61,7 +61,8 @@ def start(arguments: Sequence[str] | None = None) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0; or 1, where `poem calibration check` found something; or 2, with one line on standard error, for wrong input; or 128 + the number of the signal that came.
+    0; or 1, where `poem calibration check` found something; or 2, with one line on standard error, for wrong
+    input; or 128 + the number of the signal that came.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if empty := _empty_option(arguments):

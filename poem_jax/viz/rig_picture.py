@@ -18,7 +18,7 @@ PANEL_PX = 620
 _MARGIN_PX = 60
 _FRUSTUM_SHARE = 0.16
 """Of the rig's extent: the length of a camera's frustum."""
-_PAPER, _INK, _GREY = (255, 255, 255), (40, 40, 40), (190, 190, 190)
+_PAPER, _INK = (255, 255, 255), (40, 40, 40)
 _CAMERA_RGB = ((31, 119, 180), (214, 90, 20), (44, 140, 44), (180, 40, 40), (130, 90, 170), (120, 80, 60))
 _HAND_RGB = (120, 120, 120)
 _KEYPOINT_RGB, _ELSEWHERE_RGB = (60, 220, 90), (255, 60, 60)
@@ -140,7 +140,7 @@ def _draw_ruler(panel: Array, pixels_per_m: float) -> None:
     power = 10.0 ** np.floor(np.log10(wanted))
     length = max(step * power for step in (1, 2, 5) if step * power <= wanted)
     start = np.array([12.0, PANEL_PX - 16.0])
-    _line(panel, start, start + [length * pixels_per_m, 0], _INK, 2)
+    _line(panel, start, start + np.array([length * pixels_per_m, 0]), _INK, 2)
     _text(panel, f"{length:g} m", (12, PANEL_PX - 24), _INK)
 
 

@@ -90,9 +90,9 @@ def test_offsets_in_time_are_found_with_the_places():
 
 def test_too_little_is_refused(take):
     rig, uv = take
-    with pytest.raises(ValueError, match="at least 10 hands.*got 4.*longer take"):
+    with pytest.raises(ValueError, match=r"at least 10 hands.*got 4.*longer take"):
         refine_rig(rig, uv[:6])
     blind = uv.copy()
     blind[:, :, 3] = np.nan
-    with pytest.raises(ValueError, match="camera 'above'.*150 key points.*got 0"):
+    with pytest.raises(ValueError, match=r"camera 'above'.*150 key points.*got 0"):
         refine_rig(rig, blind)
