@@ -64,13 +64,45 @@ def fundamental_matrix(rig: Rig, a: int, b: int) -> Float[Array, "3 3"]:
 def median_distance(
     F: Float[Array, "3 3"], points_a: Float[Array, "point 2"], points_b: Float[Array, "point 2"]
 ) -> float:
-    """Return the median first-order geometric distance of pairs of points from x_b^T F x_a = 0.
-
-    |x_b^T F x_a| / |(F x_a, F^T x_b)_xy| (Hartley and Zisserman, 11.9); NaN for fewer than `MIN_POINTS`.
-    """
-    a, b = (np.pad(points, ((0, 0), (0, 1)), constant_values=1.0) for points in (points_a, points_b))
-    lines_b, lines_a = a @ F.T, b @ F
-    slope = np.sqrt((lines_a[:, :2] ** 2).sum(-1) + (lines_b[:, :2] ** 2).sum(-1))
-    found = np.abs((lines_b * b).sum(-1)) / np.maximum(slope, 1e-12)
+    """Return the median of `point_distances`; NaN for fewer than `MIN_POINTS` pairs."""
+    found = point_distances(F, points_a, points_b)
     found = found[np.isfinite(found)]
     return float(np.median(found)) if len(found) >= MIN_POINTS else np.nan
+
+
+def point_distances(
+    F: Float[Array, "3 3"], points_a: Float[Array, "*point 2"], points_b: Float[Array, "*point 2"]
+) -> Float[Array, "*point"]:
+    """Return the first-order geometric distance of pairs of points from x_b^T F x_a = 0, pixels.
+
+    |x_b^T F x_a| / |(F x_a, F^T x_b)_xy| (Hartley and Zisserman, 11.9); NaN where a point is NaN, or F is
+    zero, as of two cameras at one place.
+    """
+    ones = np.ones((*points_a.shape[:-1], 1))
+    a, b = np.concatenate([points_a, ones], -1), np.concatenate([points_b, ones], -1)
+    lines_b, lines_a = a @ F.T, b @ F
+    slope = np.sqrt((lines_a[..., :2] ** 2).sum(-1) + (lines_b[..., :2] ** 2).sum(-1))
+    return np.abs((lines_b * b).sum(-1)) / np.where(slope > 0, slope, np.nan)
+
+
+def pair_distances_px(
+    rig: Rig, keypoints_px: Float[Array, "frame hand view joint 2"], cap_px: float
+) -> Float[Array, "pair frame hand joint"]:
+    """Return how far the key points of every pair of cameras lie from each other's epipolar lines.
+
+    Args:
+        rig: The cameras.
+        keypoints_px: In pixels of the raw images; NaN = unseen.
+        cap_px: No distance counts for more, and points that no ray reaches count for as much.
+
+    Returns: Pixels of the undistorted images, pairs in the order of `itertools.combinations`; NaN where one
+        of the two does not see the point.
+    """
+    ideal = np.moveaxis(ideal_keypoints(rig, keypoints_px), 2, 0)
+    seen = np.moveaxis(np.isfinite(keypoints_px).all(-1), 2, 0)
+    distances = []
+    for a, b in combinations(range(rig.num_views), 2):
+        found = point_distances(fundamental_matrix(rig, a, b), ideal[a], ideal[b])
+        capped = np.where(np.isfinite(found), np.minimum(found, cap_px), cap_px)
+        distances.append(np.where(seen[a] & seen[b], capped, np.nan))
+    return np.stack(distances)

@@ -12,6 +12,9 @@ class Finding(NamedTuple):
     """What was seen, with its figures: a sentence without a full stop."""
     fix: str
     """What the user is to do: an imperative without a full stop."""
+    fatal: bool = True
+    """Whether nothing right can come of it; else most of the cameras or the frames serve, and it is a
+    warning."""
 
     def __str__(self) -> str:
         """Return evidence and fix as one line."""

@@ -1,7 +1,9 @@
-"""Which cameras do not show what the others show, and why: exchanged, mirrored, turned or copied images.
+"""Which cameras do not show what the others show, and why: exchanged, mirrored, turned or copied images, a
+wrong lens, another moment, or a camera that was moved.
 
 What tells is the distance of key points from each other's epipolar lines. A cause is named where undoing it
 brings all pairs of cameras together and undoing no other does; otherwise the pairs are named that disagree.
+Causes that need nothing to be estimated come first, a new place of a camera, which explains nearly all, last.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,14 +18,18 @@ from poem_jax.calibration.epipolar import (
     median_distance,
 )
 from poem_jax.calibration.findings import Finding
+from poem_jax.calibration.lens_mistakes import judge_lens
+from poem_jax.calibration.one_camera import LoneCamera, explain_camera
+from poem_jax.calibration.time_offsets import find_offsets
+from poem_jax.calibration.time_words import LATE_FRAMES, late_cameras
 from poem_jax.geometry.rig import Rig
 from poem_jax.typing import Array, Float
 
 SUSPICIOUS_SHARE = 0.006
 """Of the diagonal of the images: a median epipolar distance beyond it is more than detectors' noise. Chosen
 between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
-CAUSES = ("copied images", "flipped image", "cameras exchanged")
-"""Names of the findings that say why views disagree, not only that they do."""
+UNEXPLAINED = ("one view disagrees", "views disagree")
+"""Names of the findings that say only that views disagree, not why."""
 MAX_ORDERED_VIEWS = 5
 """Of so many cameras every order is tried; of more, every exchange of two."""
 MAX_EXCHANGED_VIEWS = 12
@@ -36,6 +42,8 @@ _COPIED_SHARE = 0.1
 image."""
 _CLEAR = 2.0
 """A cause must leave half the distance that any other cause leaves."""
+_TIME_IS_ENOUGH = 1.3
+"""Offsets in time are named where they leave so much more than the best place of one camera, at most."""
 
 _Flip = Callable[[Array, Array], Array]
 _FLIPS: dict[str, _Flip] = {
@@ -50,6 +58,7 @@ def judge_views(
     keypoints_px: Float[Array, "frame hand view joint 2"],
     *,
     extent_share: float = 0.0,
+    time_s: Float[Array, " frame"] | None = None,
 ) -> list[Finding]:
     """Say which cameras' key points do not fit together, and the cause where it is clear; [] = all is well.
 
@@ -59,11 +68,14 @@ def judge_views(
             network from the images; one joint or 21.
         extent_share: How far key points may be off as a share of the hand's extent in the images, beyond
             the noise of a detector; for the predictions of networks.
+        time_s: When the frames were taken, seconds; None = they are evenly spaced, in the order of time.
 
-    Returns: At most one finding, of the name `copied images`, `flipped image`, `cameras exchanged`,
-        `one view disagrees` or `views disagree`.
+    Returns: At most one finding, of the name `copied images`, `flipped image`, `cameras exchanged`, one of a
+        lens (`lens_mistakes.NAMES`), `time offset`, `camera moved` or a mistake's (`mistakes.HYPOTHESES`) of
+        one camera, `one view disagrees` or `views disagree`.
     """
-    keypoints_px = _few(np.asarray(keypoints_px, np.float64))
+    every = np.asarray(keypoints_px, np.float64)
+    keypoints_px = spread_frames(every)
     ideal = ideal_keypoints(rig, keypoints_px)
     limit = SUSPICIOUS_SHARE * float(np.linalg.norm(rig.size_wh, axis=-1).mean())
     limit = max(limit, extent_share * _extent(keypoints_px))
@@ -78,7 +90,43 @@ def judge_views(
     fitting.sort(key=lambda pair: pair[0])
     if fitting and (len(fitting) == 1 or fitting[1][0] > _CLEAR * fitting[0][0]):
         return [fitting[0][1]]
-    return _alone(rig, distances, limit) or [_pairs(rig, distances, limit)]
+    if rig.num_views <= MAX_EXCHANGED_VIEWS:
+        lens = judge_lens(rig, keypoints_px, limit)
+        if lens:
+            return lens
+    view = _alone(distances, limit)
+    cause = None if view is None else explain_camera(rig, keypoints_px, view, limit)
+    if cause is not None and cause.known:
+        return [cause.finding]
+    late = _late(rig, every, time_s, view, cause, limit)
+    if late:
+        return late
+    if view is None:
+        return [_pairs(rig, distances, limit)]
+    return [_lone(rig, distances, limit, view) if cause is None else cause.finding]
+
+
+def _late(
+    rig: Rig,
+    keypoints_px: Array,
+    time_s: Array | None,
+    view: int | None,
+    cause: LoneCamera | None,
+    limit: float,
+) -> list[Finding]:
+    """Name cameras that took their frames earlier or later, where this explains about all."""
+    if rig.num_views > MAX_EXCHANGED_VIEWS:
+        return []
+    offsets = find_offsets(rig, keypoints_px, time_s, view=view)
+    if offsets is None or offsets.error_px > limit or np.abs(offsets.frames).max() < LATE_FRAMES:
+        return []
+    if cause is not None:
+        moved = _worst(
+            epipolar_distances_px(cause.rig, ideal_keypoints(cause.rig, spread_frames(keypoints_px)))
+        )
+        if offsets.error_px > _TIME_IS_ENOUGH * moved:
+            return []
+    return [late_cameras(rig, offsets, time_s)]
 
 
 def _causes(rig: Rig, keypoints_px: Array) -> Iterator[tuple[float, Finding]]:
@@ -173,20 +221,23 @@ def _one_is_wrong(a: int, b: int, distances: Float[Array, "view view"], limit: f
     return bool(distances[a, b] > limit or first != second)
 
 
-def _alone(rig: Rig, distances: Array, limit: float) -> list[Finding]:
-    """Name the one view that disagrees, where the others agree with each other."""
+def _alone(distances: Array, limit: float) -> int | None:
+    """Return the one view that disagrees, where the others agree with each other."""
+    count = len(distances)
     apart = distances > limit
-    agree = [~np.delete(np.delete(apart, view, 0), view, 1).any() for view in range(rig.num_views)]
-    if rig.num_views < 3 or sum(agree) != 1:
-        return []
-    view = agree.index(True)
+    agree = [~np.delete(np.delete(apart, view, 0), view, 1).any() for view in range(count)]
+    return agree.index(True) if count > 2 and sum(agree) == 1 else None
+
+
+def _lone(rig: Rig, distances: Array, limit: float, view: int) -> Finding:
     others = ", ".join(f"'{name}'" for name in rig.names if name != rig.names[view])
     evidence = (
         f"the key points of these cameras do not fit together: {_named_pairs(rig, distances, limit)}; "
         f"without '{rig.names[view]}' the others ({others}) agree, so its image, its place or its "
         "calibration is wrong, or it is black, covered, or of another moment"
     )
-    return [Finding("one view disagrees", evidence, f"correct '{rig.names[view]}', or leave it out")]
+    fix = f"correct '{rig.names[view]}', or leave it out"
+    return Finding("one view disagrees", evidence, fix, fatal=False)
 
 
 def _pairs(rig: Rig, distances: Array, limit: float) -> Finding:
@@ -195,6 +246,7 @@ def _pairs(rig: Rig, distances: Array, limit: float) -> Finding:
         f"the key points of these cameras do not fit together: {_named_pairs(rig, distances, limit)}. "
         "Calibration, order of the cameras, or frames that are not of one moment?",
         "the results are not to be trusted to the millimetre",
+        fatal=False,
     )
 
 
@@ -223,7 +275,9 @@ def _extent(keypoints_px: Array) -> float:
     return float(np.median(np.linalg.norm(np.nanmax(hands, -2) - np.nanmin(hands, -2), axis=-1)))
 
 
-def _few(keypoints_px: Array) -> Array:
+def spread_frames(
+    keypoints_px: Float[Array, "frame hand view joint 2"],
+) -> Float[Array, "kept hand view joint 2"]:
     """Return key points of frames spread over the take, no more than the medians need."""
     frames, hands, _, joints, _ = keypoints_px.shape
     kept = max(1, _MAX_POINTS // max(1, hands * joints))

@@ -51,8 +51,8 @@ def check_triangulation(rig: Rig, keypoints_px: Float[Array, "frame hand view 21
         return
     findings = explain(rig, keypoints_px, adult_hand_size(), JOINT_ORDERS)
     if PALM_M[0] <= palm_m <= PALM_M[1]:
-        # Without a known cause some views may serve: those that do not are named as a warning.
-        findings = [finding for finding in findings if finding.name not in ("views disagree", "no hand")]
+        # Where some views may serve those that do not are named as a warning.
+        findings = [finding for finding in findings if finding.fatal]
     if findings:
         raise ValueError("; and ".join(map(str, findings)))
     if not PALM_M[0] <= palm_m <= PALM_M[1]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from poem_jax.cli.calibration import Calibration
 from poem_jax.cli.demo import Demo
 from poem_jax.cli.detect import Detect
 from poem_jax.cli.evaluate import Eval
@@ -22,14 +23,33 @@ from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop
 from poem_jax.cli.train import Train
 
 Command = (
+<<<<<<< HEAD
     Demo | Reconstruct | Fit | Detect | Retarget | Inspect | Train | Eval | ImportTorch | ExportTorch | Pack
+=======
+    Demo
+    | Reconstruct
+    | Fit
+    | Detect
+    | Calibration
+    | Retarget
+    | Inspect
+    | Train
+    | Eval
+    | ImportTorch
+    | ExportTorch
+    | Pack
+>>>>>>> i15-linter
 )
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
+<<<<<<< HEAD
     | Annotated[Retarget, tyro.conf.subcommand("retarget")]
+=======
+    | Annotated[Calibration, tyro.conf.subcommand("calibration")]
+>>>>>>> i15-linter
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -51,7 +71,8 @@ def start(arguments: Sequence[str] | None = None) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0; or 2, with one line on standard error, for wrong input; or 128 + the number of the signal that came.
+    0; or 1, where `poem calibration check` found something; or 2, with one line on standard error, for wrong
+    input; or 128 + the number of the signal that came.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if empty := _empty_option(arguments):
@@ -61,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     set_up_logging()
     try:
         with stop_on_signals():
-            _run(command)
+            return _run(command)
     except KeyboardInterrupt as request:
         print(f"poem: stopped by {request or 'SIGINT'}", file=sys.stderr)
         return exit_code(request)
@@ -70,14 +91,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"poem: error: {error}", file=sys.stderr)
         return USAGE_ERROR
-    return 0
 
 
-def _run(command: Command) -> None:
+def _run(command: Command) -> int:
     from poem_jax.io.compilation_cache import use_compilation_cache
 
     use_compilation_cache()
-    command.run()
+    return command.run() or 0
 
 
 def parse(arguments: Sequence[str]) -> Command:

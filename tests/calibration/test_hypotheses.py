@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from poem_jax.calibration.hypotheses import HYPOTHESES, HandSize, explain
+from poem_jax.calibration.hypotheses import HandSize, explain
+from poem_jax.calibration.mistakes import HYPOTHESES
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.distortion import distort_pixels
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
