@@ -1,6 +1,6 @@
 """The folder of a capture: its calibration, and its images, one per camera or one folder per frame.
 
-    DIR/rig.json or DIR/calibration/rig.json
+    DIR/rig.json or DIR/calibration/rig.json, else the calibration of another tool in DIR or DIR/calibration
 
     DIR/<camera>.jpg                    one frame
     DIR/frames/<frame>/<camera>.jpg     a take
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from poem_jax.calibration.rig_json import read_rig
+from poem_jax.calibration.read_calibration import find_calibrations, read_calibration
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import name_key, safe_file_names
 from poem_jax.io.video import ImageSource
@@ -69,24 +69,40 @@ def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[
 
 
 def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) -> Rig:
-    """Read the rig of a capture: the given file, else `rig.json` or `calibration/rig.json` in the folder.
+    """Read the rig of a capture: the given calibration, of any kind that is read, else what is in the folder.
 
-    Raises: FileNotFoundError, ValueError: as `read_rig`.
+    Raises: FileNotFoundError, ValueError: as `read_calibration` and `find_rig_file`.
     """
-    return read_rig(find_rig_file(folder) if rig is None else rig)
+    return read_calibration(find_rig_file(folder) if rig is None else rig)
 
 
 def find_rig_file(folder: str | os.PathLike) -> Path:
-    """Return the rig's file in a capture's folder.
+    """Return the rig's file in a capture's folder: `rig.json`, else the one calibration of another tool.
 
-    Raises: FileNotFoundError: there is none.
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: there are several, of which none is `rig.json`.
     """
-    places = [Path(folder) / name for name in RIG_FILES]
+    folder = Path(folder)
+    places = [folder / name for name in RIG_FILES]
     found = next((place for place in places if place.is_file()), None)
-    if found is None:
+    if found is not None:
+        return found
+    others = [
+        files[0]
+        for place in (folder, folder / "calibration")
+        if place.is_dir()
+        for files in find_calibrations(place)
+    ]
+    if len(others) > 1:
+        names = ", ".join(str(path.relative_to(folder)) for path in others[:8])
+        raise ValueError(f"{folder} holds several calibrations, {names}: say which by --rig FILE")
+    if not others:
         looked = " or ".join(map(str, places))
-        raise FileNotFoundError(f"no {looked}: no rig: pass --rig FILE, or put it there")
-    return found
+        raise FileNotFoundError(
+            f"no {looked}, nor a calibration of another tool there: no rig: pass --rig FILE, or put it there"
+        )
+    return others[0]
 
 
 def frame_key(name: str) -> str | int:

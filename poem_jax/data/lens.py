@@ -36,7 +36,8 @@ def project_raw(
 
     Returns:
         Raw pixels, and the points in the camera's frame. Pixels are NaN for points behind the camera and for
-        those so far off the axis that the distortion polynomial turns back: the lens does not show them.
+        those so far off the axis that the distortion polynomial turns back, or beyond `WIDEST_ANGLE` of a
+        fisheye: the lens does not show them.
     """
     K, dist = rig.K[view], rig.dist[view]
     points_cam = transform_points(rig.T_cam_from_world[view], np.asarray(points_world, np.float64))
@@ -78,7 +79,7 @@ def picture_map(
 
     Args:
         K: Intrinsics of the photographs.
-        dist: Their distortion, the 5 or 8 terms of `geometry.distortion`.
+        dist: Their lens, the terms of `geometry.distortion`.
         K_picture: Intrinsics of the picture wanted.
         hw: Size of the picture wanted.
         step: Raw pixels per picture pixel; above 1 several samples per pixel are averaged, as otherwise
