@@ -23,9 +23,6 @@ from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop
 from poem_jax.cli.train import Train
 
 Command = (
-<<<<<<< HEAD
-    Demo | Reconstruct | Fit | Detect | Retarget | Inspect | Train | Eval | ImportTorch | ExportTorch | Pack
-=======
     Demo
     | Reconstruct
     | Fit
@@ -38,18 +35,14 @@ Command = (
     | ImportTorch
     | ExportTorch
     | Pack
->>>>>>> i15-linter
 )
 _Commands = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
-<<<<<<< HEAD
     | Annotated[Retarget, tyro.conf.subcommand("retarget")]
-=======
     | Annotated[Calibration, tyro.conf.subcommand("calibration")]
->>>>>>> i15-linter
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
