@@ -9,7 +9,7 @@ const MEASURES = [
     title: "Uncertainty per joint, mm (one sigma)", of: (values) => values,
   },
   {
-    name: "error", label: "Reprojection", unit: "px", factor: 1, digits: 1, array: "error_px",
+    name: "error", label: "Error", unit: "px", factor: 1, digits: 1, array: "error_px",
     title: "From key point to joint, px", of: overViews,
   },
   {
