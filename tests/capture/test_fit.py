@@ -19,7 +19,7 @@ from poem_jax.capture.pipeline import fit, reconstruct
 from poem_jax.capture.take import Take, make_take, read_keypoint_take, read_take
 from poem_jax.cli import main
 from poem_jax.data.capture_folder import FramePaths
-from poem_jax.geometry.distortion import distort_pixels
+from poem_jax.geometry.distortion import distort_pixels, fisheye_lens, stack_lenses
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
 from poem_jax.geometry.world_origin import move_origin
@@ -342,6 +342,24 @@ def test_points_beyond_the_fold_of_a_lens_are_dropped(take):
     ideal = ideal_keypoints(take.rig, keypoints)
     assert np.isnan(ideal[0, 0, 0, 0]).all()
     assert np.isnan(ideal).sum() == 2
+
+
+@pytest.mark.slow
+def test_the_same_hands_are_found_through_fisheyes_and_other_lenses(take, fitted, truth, tmp_path):
+    """A rig of mixed lenses; what a fisheye sees too far aside is left out, and said."""
+    lenses = [fisheye_lens(np.array([0.05, -0.02, 0.004, -0.001]))] * 2
+    lenses += [np.array([0.5, 0.1, 1e-3, -2e-3, 0.01, 0.6, 0.05, 1e-3, 1e-3, 0, -1e-3, 0, 0.02, -0.01])] * 2
+    rig = take.rig._replace(dist=stack_lenses(lenses))
+    ideal = np.moveaxis(ideal_keypoints(take.rig, take.frames.hands.keypoints_px), 2, 0)
+    raw = distort_pixels(ideal.reshape(VIEWS, -1, 2), rig.K, rig.dist).reshape(ideal.shape)
+    keypoints = np.moveaxis(raw, 0, 2).copy()
+    keypoints[0, 0, 0, 3] = rig.K[0, :2, 2] + [1.6 * rig.K[0, 0, 0], 0]
+    arrays = fit(with_keypoints(rig, keypoints), tmp_path, progress=False).arrays
+    assert np.abs(error_mm(arrays, truth) - error_mm(fitted.arrays, truth))[1:].max() < 0.5
+    warnings = json.loads((tmp_path / "report.json").read_text())["warnings"]
+    assert [
+        w for w in warnings if "camera 'cam_0': 1 key points lie where its fisheye looks more than 85" in w
+    ]
 
 
 def test_hands_outside_their_image_are_not_fitted(files, take, tmp_path, caplog):
