@@ -220,7 +220,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of real data")
     given = parser.parse_args()
     use_compilation_cache()
-    logging.basicConfig(level=logging.ERROR)
+    logging.getLogger("poem_jax").setLevel(logging.ERROR)
     for name, row in ROWS.items():
         if given.only in (None, name):
             row(given.data)
