@@ -14,14 +14,12 @@ does not know its own noise). The hand never leaves the way between what it was 
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic
 
 import numpy as np
 
-from poem_jax.fitting.moving_hands import MovingHand
+from poem_jax.fitting.moving_hands import Hand
 from poem_jax.typing import Array, Float
-
-Hand = TypeVar("Hand", bound=MovingHand)
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ class FrameNoise:
 
 def bend(
     first: tuple[float, Array], middle: tuple[float, Array], last: tuple[float, Array]
-) -> tuple[Float[Array, "joint 3"], float]:
+) -> tuple[Float[Array, "*batch 3"], float]:
     """Return how far the joints in the middle of three moments (seconds, joints) lie off the straight way.
 
     And the variance of this if that of every coordinate is 1, and no more moves than noise.

@@ -7,7 +7,7 @@ between them likewise.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, Self
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from poem_jax.hand.topology import (
 from poem_jax.typing import Array, Float
 
 
+@runtime_checkable
 class MovingHand(Protocol):
     """A hand at one moment, in the world, metres."""
 
@@ -39,9 +40,12 @@ class MovingHand(Protocol):
         """Points by which its motion is measured."""
         ...
 
-    def towards(self, other: Self, share: float) -> Self:
-        """Return the hand that lies `share` of the way (0 to 1) from this one to another."""
+    def towards(self, other: Any, share: float) -> Any:
+        """Return the hand that lies `share` of the way (0 to 1) from this one to another of its kind."""
         ...
+
+
+Hand = TypeVar("Hand", bound=MovingHand)
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class MeshHand:
     points: Float[np.ndarray, "point 3"]
     """Carried along with the joints; there may be none."""
 
-    def towards(self, other: Self, share: float) -> Self:
+    def towards(self, other: "MeshHand", share: float) -> "MeshHand":
         """See `MovingHand`. Of a rigid motion M from a to b: M^s ((1 - s) a + s M^-1 b)."""
         R = procrustes(self.joints, other.joints, with_scale=False).R
         begin, end = self.joints.mean(0), other.joints.mean(0)
@@ -63,7 +67,7 @@ class MeshHand:
             returned = rotate_points(R.T, b - end)
             return rotate_points(turn, a - begin + share * (returned - (a - begin))) + place
 
-        return type(self)(moved(self.joints, other.joints), moved(self.points, other.points))
+        return MeshHand(moved(self.joints, other.joints), moved(self.points, other.points))
 
 
 def _carriers() -> np.ndarray:
@@ -96,7 +100,7 @@ class ModelHand:
         shape: Float[Array, "10"],
         translation: Float[Array, "3"],
         expected: Float[Array, "21 3"] | None = None,
-    ) -> Self:
+    ) -> "ModelHand":
         """Make the hand of `hand_mesh(model, pose, shape, translation)`.
 
         Args:
@@ -114,13 +118,13 @@ class ModelHand:
         offsets = rotate_points(transpose(hand._bones), (expected - hand.joints)[:, None])[:, 0]
         return cls(model, hand.rotations, shape, wrist, offsets)
 
-    def towards(self, other: Self, share: float) -> Self:
+    def towards(self, other: "ModelHand", share: float) -> "ModelHand":
         """See `MovingHand`."""
         turns = axis_angle_from_rotation(matmul(transpose(self.rotations), other.rotations))
         offsets = self.offsets
         if offsets is not None and other.offsets is not None:
             offsets = offsets + share * (other.offsets - offsets)
-        return type(self)(
+        return ModelHand(
             self.model,
             matmul(self.rotations, rotation_from_axis_angle(share * turns)),
             self.shape + share * (other.shape - self.shape),

@@ -54,11 +54,16 @@ def test_the_way_moves_with_the_world(kind):
 
 @pytest.mark.parametrize("kind", [mesh_of, lambda hand: hand])
 def test_a_turn_across_half_a_circle_takes_the_short_way(kind):
-    """From 170 degrees to -170, by 180; a rigid hand stays rigid on the way."""
+    """From 170 degrees to -170, by 180; a rigid hand stays rigid on the way.
+
+    Of hands of points the joints' middle goes straight, where that of a hand model goes round the wrist.
+    """
     axis = np.array([0, 0, 1.0])
     a, b = (kind(posed(0, np.deg2rad(angle) * axis)) for angle in (170, -170))
-    half = a.towards(b, 0.5)
-    np.testing.assert_allclose(points(half), points(kind(posed(0, np.pi * axis))), atol=1e-9)
+    half, expected = points(a.towards(b, 0.5)), points(kind(posed(0, np.pi * axis)))
+    if isinstance(a, MeshHand):
+        half, expected = (x - x[:21].mean(0) for x in (half, expected))
+    np.testing.assert_allclose(half, expected, atol=1e-6)
 
 
 def test_a_hand_model_keeps_the_lengths_of_its_bones():
