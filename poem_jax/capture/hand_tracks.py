@@ -9,7 +9,7 @@ Costs are in nats. Sides: with the log odds s of a track and t of a piece, joini
 log cosh(s/2) + |t|/2 - log cosh((s + t)/2), about min(|s|, |t|) where they differ, little where they agree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -101,7 +101,7 @@ class _Way(NamedTuple):
     """Of every track."""
 
 
-def follow_hands(frames: Sequence[Sequence[PlacedHand]]) -> Tracks:
+def follow_hands(frames: Iterable[Sequence[PlacedHand]]) -> Tracks:
     """Follow the hands of a take.
 
     Args:
@@ -124,24 +124,47 @@ def follow_hands(frames: Sequence[Sequence[PlacedHand]]) -> Tracks:
     return Tracks(tracks, _unsure_joins(pieces, ways), jumps)
 
 
-def link_frames(frames: Sequence[Sequence[PlacedHand]]) -> list[Piece]:
+class _OpenPiece:
+    """A piece that may go on: what a long take adds a frame to costs the same in every frame."""
+
+    def __init__(self, start: int, hand: PlacedHand) -> None:
+        self._start, self._hands = start, [hand]
+        self._votes = hand.vote
+
+    def add(self, hand: PlacedHand) -> "_OpenPiece":
+        self._hands.append(hand)
+        self._votes += hand.vote
+        return self
+
+    @property
+    def last_two(self) -> Sequence[PlacedHand]:
+        return self._hands[-2:]
+
+    @property
+    def vote(self) -> float:
+        return _WEIGHT_OF_VOTES * self._votes
+
+    def closed(self) -> Piece:
+        return Piece(self._start, tuple(self._hands))
+
+
+def link_frames(frames: Iterable[Sequence[PlacedHand]]) -> list[Piece]:
     """Return the runs of frames in which hands can be followed without doubt, by their beginnings."""
-    open_pieces: list[Piece] = []
+    open_pieces: list[_OpenPiece] = []
     closed: list[Piece] = []
     for frame, hands in enumerate(frames):
         links = _links(open_pieces, hands)
-        closed += [piece for i, piece in enumerate(open_pieces) if i not in links]
+        closed += [piece.closed() for i, piece in enumerate(open_pieces) if i not in links]
         taken = {hand: piece for piece, hand in links.items()}
         open_pieces = [
-            open_pieces[taken[i]]._replace(hands=(*open_pieces[taken[i]].hands, hand))
-            if i in taken
-            else Piece(frame, (hand,))
+            open_pieces[taken[i]].add(hand) if i in taken else _OpenPiece(frame, hand)
             for i, hand in enumerate(hands)
         ]
-    return sorted([*closed, *open_pieces], key=lambda piece: (piece.start, piece.last))
+    closed += [piece.closed() for piece in open_pieces]
+    return sorted(closed, key=lambda piece: (piece.start, piece.last))
 
 
-def _links(pieces: Sequence[Piece], hands: Sequence[PlacedHand]) -> dict[int, int]:
+def _links(pieces: Sequence[_OpenPiece], hands: Sequence[PlacedHand]) -> dict[int, int]:
     """Return which piece goes on as which hand, without those links that another way nearly equals.
 
     The table of costs has one more column for every piece (it ends) and one more row for every hand (it
@@ -166,8 +189,8 @@ def _links(pieces: Sequence[Piece], hands: Sequence[PlacedHand]) -> dict[int, in
     }
 
 
-def _link_cost(piece: Piece, hand: PlacedHand) -> float:
-    expected = piece.hands[-1].joints_world + _velocity(piece.hands[-2:])
+def _link_cost(piece: _OpenPiece, hand: PlacedHand) -> float:
+    expected = piece.last_two[-1].joints_world + _velocity(piece.last_two)
     sides = _cost_of_sides(*(np.clip((piece.vote, hand.vote), -_MAX_VOTE_OF_LINK, _MAX_VOTE_OF_LINK)))
     return _distance(expected, hand.joints_world) / _MOTION_SCALE_M + sides
 

@@ -8,7 +8,7 @@ import tyro
 
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Detector, Flag, Folder, OptionalFile, OptionalFolder
+from poem_jax.cli.options import Detector, Flag, Folder, MomentOptions, Moments, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.hand.model import HandModel
@@ -34,6 +34,7 @@ class Fit:
     """Hands that are looked for in a capture's images."""
     video: Flag = False
     """As for `poem detect`."""
+    moments: MomentOptions = Moments()
     images: OptionalFolder = None
     """Capture folder with the images to draw on, where KEYPOINTS is a file."""
     mano: OptionalFile = None
@@ -59,14 +60,16 @@ class Fit:
         check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
         hand = hand_from(self.mano)
         keypoints, images = self.keypoints, self.images
+        if self.moments.are_part and not keypoints.is_dir():
+            raise ValueError(f"--start, --end and --every are for a capture's folder; {keypoints} is a file")
         if keypoints.is_dir():
             if images is not None:
                 raise ValueError(
                     f"--images goes with a file of key points; {keypoints} is a folder of images"
                 )
             images = keypoints
-            keypoints = where_hands_are(images, self.out, self.rig, self.max_hands, self.video)
-        take = read_keypoint_take(keypoints, self.rig, images)
+            keypoints = where_hands_are(images, self.out, self.rig, self.max_hands, self.video, self.moments)
+        take = read_keypoint_take(keypoints, self.rig, images, self.moments.timing())
         say(f"{take.num_frames} frames; the first run on a machine compiles the fit, once")
         with tells_what_is_left(self.out):
             meshes = self.meshes or None

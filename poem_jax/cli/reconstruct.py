@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Literal
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.fit import hand_from
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Detector, Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
+from poem_jax.cli.options import (
+    Detector,
+    Flag,
+    Folder,
+    MomentOptions,
+    Moments,
+    OptionalFile,
+    OptionalFolder,
+    PositionalFolder,
+)
 
 if TYPE_CHECKING:
     from poem_jax.capture.write import Written
@@ -18,7 +27,8 @@ if TYPE_CHECKING:
 class Reconstruct:
     """Reconstruct the hands of a capture: meshes, overlays, a 3D page, arrays and a report.
 
-    DIR holds one image per camera, <camera>.jpg or .png, or frames/<frame>/<camera>.jpg for a take. Boxes or
+    DIR holds a video for each camera, <camera>.mp4, or a folder of images, <camera>/0001.jpg; or one image,
+    <camera>.jpg or .png; or frames/<frame>/<camera>.jpg. Boxes or
     2D key points may say where the hands are in each view, else they are looked for; see docs/captures.md.
     """
 
@@ -38,6 +48,7 @@ class Reconstruct:
     """poem (or network): the network, from the images. fit: no network, the hand model fitted to key points
     (if boxes are given they must hold them). auto: both are tried on a few frames, by views that neither is
     given, and the better one does the take; where only one can run, it does."""
+    moments: MomentOptions = Moments()
     checkpoint: OptionalFolder = None
     """Of the network: model folder that poem_jax.save wrote; without it the shipped weights."""
     mano: OptionalFile = None
@@ -68,7 +79,9 @@ class Reconstruct:
         if self.checkpoint is not None and self.folder.is_dir():
             self._check_model_fits(self.checkpoint)
         hand = hand_from(self.mano)
-        boxes = self.boxes or where_hands_are(self.folder, self.out, self.rig, self.max_hands, self.video)
+        boxes = self.boxes or where_hands_are(
+            self.folder, self.out, self.rig, self.max_hands, self.video, self.moments
+        )
         with tells_what_is_left(self.out):
             written = self._reconstruct(boxes, engine, hand)
         print_files(written, self.out)
@@ -89,7 +102,7 @@ class Reconstruct:
         from poem_jax.capture.take import read_take
         from poem_jax.cli.fit import named_detector
 
-        take = read_take(self.folder, self.rig, boxes)
+        take = read_take(self.folder, self.rig, boxes, self.moments.timing())
         what = "fit" if engine == "fit" else "model"
         say(f"{take.num_frames} frames; the first run on a machine compiles the {what}, once")
         return reconstruct(
