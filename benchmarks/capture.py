@@ -5,6 +5,7 @@ A row is a function that prints what it measured; `ROWS` lists them.
     detection   frames a second of the search for hands in four real videos (--data: the folder `data` of the
                 reference material, with caliscope_4cam_video and caliscope_4cam_hands)
     fit         frames a second of the fit of 4 cameras and two hands, key points given, files written
+    smoothing   how much hands tremble, and how late they are, before they are smoothed and after
     memory      memory of a search, then of a fit, after 200 and after 2,000 frames of a synthetic take
 """
 
@@ -19,6 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from capture_smoothing import smoothing
 
 from poem_jax.calibration.rig_json import read_rig, write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
@@ -198,7 +200,12 @@ def planted(rig: Rig, turns: Iterator[int]) -> Callable[..., list[list[DetectedH
     return detect
 
 
-ROWS: dict[str, Callable[[Path], None]] = {"detection": detection, "fit": fit_row, "memory": memory}
+ROWS: dict[str, Callable[[Path], None]] = {
+    "detection": detection,
+    "fit": fit_row,
+    "memory": memory,
+    "smoothing": lambda _: smoothing(),
+}
 """Every row takes the folder of real data."""
 
 

@@ -36,6 +36,8 @@ class Engine(NamedTuple):
     """A stream of frames in, the stream with images and results out."""
     find: Find
     """The same on trial: nothing is judged, and no image read that it does not need."""
+    hands: Hands
+    """The hand models that belong to its meshes."""
     faces: Mapping[str, Int[Array, "face 3"]]
     """Triangles by side."""
     about: Mapping[str, Any]
@@ -48,7 +50,8 @@ class EngineOptions(NamedTuple):
     checkpoint: str | os.PathLike | None = None
     network: Network | None = None
     hand: HandModel | None = None
-    smooth: bool = False
+    second_pass: bool = False
+    """Whether the fit holds each hand's frames together."""
     detector: str | None = None
 
 
@@ -92,8 +95,8 @@ def _check_options(name: EngineName | str, options: EngineOptions) -> None:
         raise ValueError(f"`engine` must be one of {', '.join(get_args(EngineName))}; got {name!r}")
     if name == "fit" and (options.checkpoint is not None or options.network is not None):
         raise ValueError("`checkpoint` and `network` are for the engine poem; a fit has no weights")
-    if name == "poem" and (options.hand is not None or options.smooth or options.detector is not None):
-        raise ValueError("`hand`, `smooth` and `detector` are for the engine fit; poem has its own hand")
+    if name == "poem" and (options.hand is not None or options.detector is not None):
+        raise ValueError("`hand` and `detector` are for the engine fit; poem has its own hand")
 
 
 def _only_one(keypoints: bool, images: bool, anything: bool) -> EngineChoice | None:
@@ -118,7 +121,7 @@ def network_engine(options: EngineOptions) -> Engine:
     about = {"weights": network.origin, "image_hw": network.config.image_hw}
     about |= {"uncertainty": f"{'' if network.trust.calibrated else 'not '}calibrated with these weights"}
     run, find = (functools.partial(stage, network=network) for stage in (by_network, try_network))
-    return Engine(run, find, network.faces(), about)
+    return Engine(run, find, network.hands(), network.faces(), about)
 
 
 def fit_engine(take: Take, options: EngineOptions) -> Engine:
@@ -127,11 +130,12 @@ def fit_engine(take: Take, options: EngineOptions) -> Engine:
 
     hands = hands_of(default_hand() if options.hand is None else options.hand)
     detector = options.detector
-    about = {"hand": "shipped hand" if options.hand is None else "given", "smooth": options.smooth}
+    about = {"hand": "shipped hand" if options.hand is None else "given"}
     about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
-    run = functools.partial(by_fit, hands=hands, smooth=options.smooth, detector=detector)
-    return Engine(run, functools.partial(try_fit, hands=hands, detector=detector), faces, about)
+    run = functools.partial(by_fit, hands=hands, smooth=options.second_pass, detector=detector)
+    find = functools.partial(try_fit, hands=hands, detector=detector)
+    return Engine(run, find, hands, faces, about)
 
 
 def by_network(frames: Iterable[Frame], take: Take, clock: Clock, network: Network) -> Iterator[Frame]:

@@ -17,7 +17,8 @@ from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.fit_trust import joint_confidence
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
+from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames, padded_times
+from poem_jax.capture.frame_times import times_of
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
 from poem_jax.capture.take import Take
 from poem_jax.fitting.detector_offsets import offsets_of
@@ -92,6 +93,7 @@ def fit_hands(
     for group, turns in _windows(frames, _CONTEXT if smooth else 0):
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
+        time_s = times_of(group)
         if not checked and shows_palms(raw):
             check_triangulation(take.rig, raw)
             checked = True
@@ -100,7 +102,7 @@ def fit_hands(
         fitted, trusted = [], []
         for index, hand in enumerate(fits):
             given = keypoints[:, index], confidence[:, index]
-            fitted.append(hand.fit(*given, take.rig))
+            fitted.append(hand.fit(*given, time_s, take.rig))
             trusted.append(joint_confidence(fitted[-1], *given, take.rig))
             warnings += hand.take_warnings()
         for frame in _with_results(group, turns, fitted, trusted):
@@ -123,7 +125,7 @@ def try_fit(
     fitted, trusted = [], []
     for index, side in enumerate(take.hand_sides):
         given, model = (keypoints[:, index], confidence[:, index]), _keypoint_models(hands, side, offsets)[0]
-        fitted.append(_run(model, *given, take.rig, config, None))
+        fitted.append(_run(model, *given, times_of(group), take.rig, config, None))
         trusted.append(joint_confidence(fitted[-1], *given, take.rig))
     yield from _with_results(group, range(len(group)), fitted, trusted)
 
@@ -193,10 +195,10 @@ class _HandFit:
         self._judged = self._said = False
         self._warnings: list[str] = []
 
-    def fit(self, keypoints: Array, confidence: Array, rig: Rig) -> "FitResult":
-        """Fit a group of frames: key points (frame, view, 21, 2) and their confidence."""
+    def fit(self, keypoints: Array, confidence: Array, time_s: Array, rig: Rig) -> "FitResult":
+        """Fit a group of frames: key points (frame, view, 21, 2), their confidence, and their times."""
         own, other = (
-            _run(model, keypoints, confidence, rig, self._config, shape)
+            _run(model, keypoints, confidence, time_s, rig, self._config, shape)
             for model, shape in zip(self._models, self._shapes, strict=True)
         )
         enough = own.valid.sum() >= _FRAMES_FOR_SHAPE
@@ -217,6 +219,7 @@ def _run(
     model: "KeypointModel",
     keypoints: Array,
     confidence: Array,
+    time_s: Array,
     rig: Rig,
     config: "FitConfig",
     shape: Array | None,
@@ -232,7 +235,7 @@ def _run(
         config = dataclasses.replace(config, lm=lm)
     padded = (padded_frames(keypoints), padded_frames(confidence))
     observations = Observations(*padded, rig.K, rig.T_cam_from_world)
-    fitted = jax.device_get(fit_take(model, observations, shape, config))
+    fitted = jax.device_get(fit_take(model, observations, shape, config, padded_times(time_s)))
     return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
 
 
@@ -251,4 +254,5 @@ def _result(fitted: "FitResult", turn: int, trusted: Array) -> HandResult:
         expected_world=fitted.keypoints[turn],
         joint_sigma_m=fitted.sigma_m[turn],
         joint_confidence=trusted[turn],
+        alone_world=fitted.alone[turn],
     )

@@ -55,6 +55,8 @@ class HandResult(NamedTuple):
     """Share of the joints that the view's lens shows; NaN = view not used."""
     joint_confidence: Float[Array, "view 21"] | None = None
     """How far each view's picture of each joint bears the result out, 0 to 1; NaN = not seen there."""
+    alone_world: Float[Array, "21 3"] | None = None
+    """The joints as this moment alone shows them; None = as `joints_world`."""
     bridged: bool = False
     """Whether the hand was not seen at this moment, and stands between those before and after it."""
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from poem_jax.capture.frame_times import SECONDS_PER_FRAME
 from poem_jax.typing import Array, Float
 
 FRAMES_TOGETHER = 64
@@ -12,3 +13,9 @@ def padded_frames(array: Float[Array, "frame *rest"]) -> Float[Array, "more *res
     """Add frames of NaN, in which nothing is seen, up to the next multiple of `FRAMES_TOGETHER`."""
     missing = -len(array) % FRAMES_TOGETHER
     return np.concatenate([array, np.full((missing, *array.shape[1:]), np.nan)])
+
+
+def padded_times(time_s: Float[Array, " frame"]) -> Float[Array, " more"]:
+    """Let moments go on as far as `padded_frames` does, at the rate of video, seconds."""
+    missing = -len(time_s) % FRAMES_TOGETHER
+    return np.concatenate([time_s, time_s[-1] + SECONDS_PER_FRAME * np.arange(1, 1 + missing)])

@@ -87,7 +87,12 @@ def reprojection_error(
 
 
 def _evidence(frame: Frame, index: int) -> Evidence | None:
-    """Return the key points that were given, else those of the heat maps, else None."""
+    """Return the key points that were given, else those of the heat maps, else None.
+
+    A hand that was bridged stands where it was not seen: nothing bears it out.
+    """
+    if frame.hands[index].bridged:
+        return None
     if frame.keypoints_px is not None:
         return Evidence(frame.keypoints_px[index], _ALL_JOINTS)
     points_px = frame.hands[index].keypoints_px

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from poem_jax.batch import Prediction
+from poem_jax.capture.fit import Hands, hands_of
 from poem_jax.capture.frame import Frame, HandCrops, HandResult
 from poem_jax.capture.network_trust import (
     GENERAL,
@@ -36,7 +37,7 @@ from poem_jax.geometry.cameras import (
 from poem_jax.geometry.distortion import distort
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
-from poem_jax.hand.model import mirror_pose
+from poem_jax.hand.model import HandModel, mirror_pose
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
@@ -65,6 +66,10 @@ class Network(NamedTuple):
         """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
         right = np.asarray(self.prepared.params["constants"]["hand"]["faces"])
         return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
+
+    def hands(self) -> Hands:
+        """Return the model's hand, of which it may give pose, shape and place, and its mirror image."""
+        return hands_of(HandModel(**self.prepared.params["constants"]["hand"]))
 
 
 def load_network(checkpoint: str | os.PathLike | None) -> Network:

@@ -1,4 +1,5 @@
-"""From a capture to hand meshes, as one line: read -> crop -> predict -> judge -> write.
+"""From a capture to hand meshes, as one line: read -> crop -> predict -> smooth -> judge ->
+write.
 
 Every stage is a function over a stream of frames (`frame.Frame`): it pulls one frame after the other from
 the stage before it, fills in its own fields, and hands it on; the last stage writes. No stage looks back, how
@@ -14,6 +15,7 @@ from poem_jax.capture.engines import EngineName, EngineOptions, engine_for
 from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network
 from poem_jax.capture.report import Clock
+from poem_jax.capture.smoothing import Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
@@ -29,8 +31,8 @@ def reconstruct(
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
     hand: HandModel | None = None,
-    smooth: bool = False,
     detector: str | None = None,
+    smoothing: Smoothing = Smoothing(),
     meshes: bool | None = None,
     progress: bool = True,
 ) -> Written:
@@ -48,8 +50,9 @@ def reconstruct(
         checkpoint: Of poem: model folder; None = the shipped weights. Not read when a network is given.
         network: Of poem: a model in memory.
         hand: Of the fit: the user's hand in MANO's schema, of either side; None = the shipped hand.
-        smooth: Of the fit: add a second pass that holds each hand's frames together.
         detector: Of the fit: what found the key points, as for `fit_hands`; None = as their file names it.
+        smoothing: What is done to the hands of a take from frame to frame; offline adds a second pass of the
+            fit that holds each hand's frames together.
         meshes: Write the meshes of every frame; None = if there is only one.
         progress: Show a progress bar when there are several frames.
 
@@ -65,16 +68,18 @@ def reconstruct(
     # A world whose origin is near the cameras.
     origin_world = distant_origin(take.rig.T_cam_from_world)
     rig = take.rig._replace(T_cam_from_world=move_origin(take.rig.T_cam_from_world, origin_world))
-    options = EngineOptions(checkpoint, network, hand, smooth, detector)
+    options = EngineOptions(checkpoint, network, hand, smoothing.mode == "offline", detector)
     chosen = engine_for(take._replace(rig=rig), engine, options)
     clock.lap("choose_engine" if chosen.choice.figures else "load_model")
     take = chosen.take
+    smoother = Smoother(take, smoothing, chosen.engine.hands)
     frames = chosen.engine.run(take.frames, take, clock)
+    frames = clock.timed("smooth", smoother.smooth(frames))
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
     style = Style(chosen.engine.faces, single if meshes is None else meshes, not single, origin_world)
     about = {"engine": chosen.choice.engine, **chosen.engine.about}
-    about |= {"engine_choice": chosen.choice.as_report()}
+    about |= {"engine_choice": chosen.choice.as_report(), "smoothing": smoother.done}
     return write_results(frames, take, Path(out), style, clock, about)
 
 
@@ -83,7 +88,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smooth: bool = False,
+    smoothing: Smoothing = Smoothing(),
     detector: str | None = None,
     meshes: bool | None = None,
     progress: bool = True,
@@ -97,7 +102,7 @@ def fit(
         out,
         engine="fit",
         hand=hand,
-        smooth=smooth,
+        smoothing=smoothing,
         detector=detector,
         meshes=meshes,
         progress=progress,

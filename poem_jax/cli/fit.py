@@ -8,9 +8,19 @@ import tyro
 
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Detector, Flag, Folder, MomentOptions, Moments, OptionalFile, OptionalFolder
+from poem_jax.cli.options import (
+    Bridge,
+    Detector,
+    Flag,
+    Folder,
+    MomentOptions,
+    Moments,
+    OptionalFile,
+    OptionalFolder,
+)
 
 if TYPE_CHECKING:
+    from poem_jax.capture.smoothing import Smoothing
     from poem_jax.hand.model import HandModel
 
 
@@ -40,7 +50,11 @@ class Fit:
     mano: OptionalFile = None
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
-    """Hold the frames of a take together in a second pass."""
+    """Hold the frames of a take together: less tremble, and hands that are not seen for a moment are bridged."""
+    causal: Flag = False
+    """Smooth by what came before alone, as a live picture has to."""
+    bridge: Bridge = None
+    """With --smooth or --causal: for how long a hand that is not seen is bridged, seconds (0.2; 0: never)."""
     detector: Detector = "file"
     """What found the key points, whose habits the fit allows for; file: what KEYPOINTS names, if anything;
     none: nothing known, they are the joints and finger tips."""
@@ -56,6 +70,7 @@ class Fit:
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
+        smoothing = smoothing_of(self.smooth, self.causal, self.bridge)
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
         hand = hand_from(self.mano)
@@ -74,7 +89,7 @@ class Fit:
         with tells_what_is_left(self.out):
             meshes = self.meshes or None
             detector = named_detector(self.detector)
-            written = fit(take, self.out, hand=hand, smooth=self.smooth, detector=detector, meshes=meshes)
+            written = fit(take, self.out, hand=hand, smoothing=smoothing, detector=detector, meshes=meshes)
         print_files(written, self.out)
         print_summary(written.report)
 
@@ -82,6 +97,16 @@ class Fit:
 def named_detector(option: Detector) -> str | None:
     """Return the name that overrides the file's; None = as the file says."""
     return None if option == "file" else option
+
+
+def smoothing_of(smooth: bool, causal: bool, bridge: float | None) -> "Smoothing":
+    """Return what the options --smooth, --causal and --bridge ask for."""
+    from poem_jax.capture.smoothing import Smoothing
+
+    if bridge is not None and not (smooth or causal):
+        raise ValueError("--bridge goes with --smooth or --causal; add one of them")
+    mode = "causal" if causal else "offline" if smooth else "off"
+    return Smoothing(mode) if bridge is None else Smoothing(mode, bridge)
 
 
 def hand_from(path: Path | None) -> "HandModel | None":

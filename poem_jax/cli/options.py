@@ -16,6 +16,7 @@ OptionalFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Detector = Literal["file", "mediapipe-hands", "none"]
 """What found key points: "file" = as their file names it, "none" = take them to be the hand model's."""
+Bridge = Annotated[float | None, tyro.conf.arg(metavar="SECONDS")]
 PositionalFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 Experiment = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
 

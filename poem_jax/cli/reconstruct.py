@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from poem_jax.cli.detect import where_hands_are
-from poem_jax.cli.fit import hand_from
+from poem_jax.cli.fit import hand_from, smoothing_of
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import (
+    Bridge,
     Detector,
     Flag,
     Folder,
@@ -19,6 +20,7 @@ from poem_jax.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from poem_jax.capture.smoothing import Smoothing
     from poem_jax.capture.write import Written
     from poem_jax.hand.model import HandModel
 
@@ -54,7 +56,11 @@ class Reconstruct:
     mano: OptionalFile = None
     """Of the fit, as for `poem fit`."""
     smooth: Flag = False
-    """Of the fit, as for `poem fit`."""
+    """As for `poem fit`."""
+    causal: Flag = False
+    """As for `poem fit`."""
+    bridge: Bridge = None
+    """As for `poem fit`."""
     detector: Detector = "file"
     """Of the fit, as for `poem fit`."""
     meshes: Flag = False
@@ -70,10 +76,11 @@ class Reconstruct:
         engine = "poem" if self.engine == "network" else self.engine
         if engine == "fit" and self.checkpoint is not None:
             raise ValueError("--checkpoint is for --engine poem; a fit has no weights")
-        if engine == "poem" and (self.mano is not None or self.smooth):
-            raise ValueError("--mano and --smooth are for --engine fit; the network has its own hand")
+        if engine == "poem" and self.mano is not None:
+            raise ValueError("--mano is for --engine fit; the network has its own hand")
         if engine == "poem" and self.detector != "file":
             raise ValueError("--detector is for --engine fit; the network sees the images themselves")
+        smoothing = smoothing_of(self.smooth, self.causal, self.bridge)
         check_folder_is_writable(self.out)
         check_inputs_stay(take_files(self.out), (self.rig, self.boxes, self.mano))
         if self.checkpoint is not None and self.folder.is_dir():
@@ -83,7 +90,7 @@ class Reconstruct:
             self.folder, self.out, self.rig, self.max_hands, self.video, self.moments
         )
         with tells_what_is_left(self.out):
-            written = self._reconstruct(boxes, engine, hand)
+            written = self._reconstruct(boxes, engine, hand, smoothing)
         print_files(written, self.out)
         print_summary(written.report)
 
@@ -96,7 +103,11 @@ class Reconstruct:
         check_rig(read_config(checkpoint), find_rig(self.folder, self.rig))
 
     def _reconstruct(
-        self, boxes: Path, engine: Literal["auto", "fit", "poem"], hand: "HandModel | None"
+        self,
+        boxes: Path,
+        engine: Literal["auto", "fit", "poem"],
+        hand: "HandModel | None",
+        smoothing: "Smoothing",
     ) -> "Written":
         from poem_jax.capture.pipeline import reconstruct
         from poem_jax.capture.take import read_take
@@ -111,7 +122,7 @@ class Reconstruct:
             engine=engine,
             checkpoint=self.checkpoint,
             hand=hand,
-            smooth=self.smooth,
+            smoothing=smoothing,
             detector=named_detector(self.detector),
             meshes=self.meshes or None,
         )
