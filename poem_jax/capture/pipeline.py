@@ -22,6 +22,8 @@ from poem_jax.geometry.world_origin import distant_origin, move_origin
 from poem_jax.hand.model import HandModel
 from poem_jax.io.writable import check_folder_is_writable
 
+NO_SMOOTHING = Smoothing()
+
 
 def reconstruct(
     take: Take,
@@ -32,7 +34,7 @@ def reconstruct(
     network: Network | None = None,
     hand: HandModel | None = None,
     detector: str | None = None,
-    smoothing: Smoothing = Smoothing(),
+    smoothing: Smoothing = NO_SMOOTHING,
     meshes: bool | None = None,
     progress: bool = True,
 ) -> Written:
@@ -88,7 +90,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smoothing: Smoothing = Smoothing(),
+    smoothing: Smoothing = NO_SMOOTHING,
     detector: str | None = None,
     meshes: bool | None = None,
     progress: bool = True,
