@@ -278,7 +278,7 @@ def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
     assert "--formats must be a list of glb, bvh" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", "--checkpoint", "ckpt"]) == 2
     assert "a fit has no weights" in capsys.readouterr().err
-    assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--smooth"]) == 2
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--mano", "hand.npz"]) == 2
     assert "for --engine fit" in capsys.readouterr().err
 
 
