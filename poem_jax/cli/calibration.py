@@ -1,5 +1,7 @@
 """`poem calibration`: check a calibration, write it in another format, refine it from the hands."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -134,7 +136,7 @@ class Refine:
         for view, name in enumerate(rig.names):
             late = f", {refined.frames_late[view]:+.2f} frames late" if self.offsets else ""
             print(
-                f"{name}: turned {_degrees(refined.turned_rad[view]):.2f} degrees, moved "
+                f"{name}: turned {math.degrees(refined.turned_rad[view]):.2f} degrees, moved "
                 f"{1000 * refined.moved_m[view]:.1f} mm{late}; off the others' epipolar lines "
                 f"{_change(refined.used_px[:, view])} px, held out {_change(refined.held_out_px[:, view])} px"
             )
@@ -150,13 +152,7 @@ class Refine:
         return 0
 
 
-def _degrees(radians: float) -> float:
-    from math import degrees
-
-    return degrees(radians)
-
-
-def _change(before_after: "tuple[float, float]") -> str:
+def _change(before_after: Iterable[float]) -> str:
     before, after = before_after
     return f"{before:.2f} -> {after:.2f}"
 

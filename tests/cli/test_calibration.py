@@ -18,7 +18,7 @@ from tests.capture.test_rig_refinement import off, touched
 def files(tmp_path_factory):
     """A folder with `rig.json` and `keypoints.npz`, and the rig."""
     folder = tmp_path_factory.mktemp("calibration")
-    rig, uv = moving_take(frames=60, noise_px=0.5)
+    rig, uv = moving_take(frames=90, noise_px=0.5)
     write_rig(folder / "rig.json", rig)
     write_boxes(folder / "keypoints.npz", HandBoxes(boxes_from_keypoints(uv), ("right",), None, uv))
     return folder, rig
@@ -61,7 +61,7 @@ def test_a_rig_that_cannot_be_read_is_a_finding(tmp_path, capsys):
 def test_images_are_drawn_on(files, tmp_path):
     folder, rig = files
     captured = tmp_path / "capture"
-    for frame in range(60):
+    for frame in range(90):
         (captured / "frames" / f"{frame:04d}").mkdir(parents=True)
     for name in rig.names:
         cv2.imwrite(str(captured / "frames" / "0000" / f"{name}.png"), np.zeros((720, 1280, 3), np.uint8))
