@@ -75,7 +75,7 @@ def fit_row(_: Path) -> None:
     There are no images, so that no overlay is drawn; what compiles does so in a shorter take before.
     """
     with tempfile.TemporaryDirectory() as folder:
-        fit(keypoint_take(64), Path(folder) / "first", progress=False)
+        fit(keypoint_take(128), Path(folder) / "first", progress=False)
         written = fit(keypoint_take(FIT_FRAMES), Path(folder) / "out", progress=False)
         spent = written.report["timings_s"]
     total = spent.pop("total")
