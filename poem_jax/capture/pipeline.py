@@ -22,7 +22,7 @@ from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network, load_network, predict_hands
 from poem_jax.capture.read import read_images
 from poem_jax.capture.report import Clock
-from poem_jax.capture.smoothing import Smoother, Smoothing
+from poem_jax.capture.smoothing import OFF, Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
@@ -40,7 +40,7 @@ def reconstruct(
     *,
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
-    smoothing: Smoothing = Smoothing(),
+    smoothing: Smoothing = OFF,
     meshes: bool | None = None,
     progress: bool = True,
 ) -> Written:
@@ -75,7 +75,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smoothing: Smoothing = Smoothing(),
+    smoothing: Smoothing = OFF,
     detector: str | None = None,
     meshes: bool | None = None,
     progress: bool = True,

@@ -45,6 +45,9 @@ class Smoothing:
             raise ValueError(f"a hand must be bridged for 0 seconds or more; got {self.bridge_s}")
 
 
+OFF = Smoothing()
+
+
 class _Moment(NamedTuple):
     """A frame on its way through the stage; one entry a hand, None = not seen."""
 
@@ -151,9 +154,13 @@ def _met(forwards: Sequence[_Moment], seen: Sequence[Sequence[MovingHand | None]
     )
     backwards = reversed(list(_forwards(turned, BOTH_WAYS)))
     return [
-        one._replace(hands=[None if a is None else a.towards(b, 0.5) for a, b in zip(one.hands, other.hands)])
+        one._replace(hands=tuple(map(_half_way, one.hands, other.hands)))
         for one, other in zip(forwards, backwards, strict=True)
     ]
+
+
+def _half_way(one: MovingHand | None, other: MovingHand | None) -> MovingHand | None:
+    return None if one is None else one.towards(other, 0.5)
 
 
 def _held(moments: Iterable[_Moment], bridge_s: float) -> Iterator[_Moment]:

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Literal
 from poem_jax.cli.detect import where_hands_are
 from poem_jax.cli.fit import hand_from
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
-from poem_jax.cli.options import Bridge, Detector, Flag, Folder, OptionalFile, OptionalFolder, PositionalFolder
+from poem_jax.cli.options import (
+    Bridge,
+    Detector,
+    Flag,
+    Folder,
+    OptionalFile,
+    OptionalFolder,
+    PositionalFolder,
+)
 
 if TYPE_CHECKING:
     from poem_jax.capture.smoothing import Smoothing

@@ -1,7 +1,7 @@
 """A filter that looks back only, for hands seen one moment after the other: the live picture's.
 
-The hand x follows what is seen, y, by a share of the way that depends on the time dt since the last moment and
-on how far it is, in the mean over the last moments, over which noise cancels and a motion does not:
+The hand x follows what is seen, y, by a share of the way that depends on the time dt since the last moment
+and on how far it is, in the mean over the last moments, over which noise cancels and a motion does not:
 
     m <- (1 - b) m + b (y - x),   v <- (1 - b)^2 v + b^2,   b = 1 - exp(-dt / T_m),
     x <- x + (1 - exp(-dt / T)) (y - x),   1 / T = (1 + e max(0, d^2 / (a v s^2) - 1)) / T_0,
@@ -9,7 +9,8 @@ on how far it is, in the mean over the last moments, over which noise cancels an
 d^2 the mean square of a joint's coordinate of m, s the noise of what is seen from one moment to the next,
 measured on the way, and v s^2 thus that of m. What noise explains is averaged over T_0; what it does not is
 motion, and followed at once (the idea of the One-Euro filter of Casiez et al. 2012, which asks the speed, and
-does not know its own noise). The hand never leaves the way between what it was and what is seen: no overshoot.
+does not know its own noise). The hand never leaves the way between what it was and what is seen: it does not
+overshoot.
 """
 
 import math

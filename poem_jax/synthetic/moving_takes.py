@@ -49,7 +49,9 @@ class Motion:
         """Return the pose, axis-angle, and the place of the root, metres, at any moments."""
         time = self._pace * np.asarray(time_s, np.float64)
         place, turn = (
-            np.einsum("s,fsx->fx", size, np.sin(2 * np.pi * _SWINGS_HZ[:, None] * time[:, None, None] + phase))
+            np.einsum(
+                "s,fsx->fx", size, np.sin(2 * np.pi * _SWINGS_HZ[:, None] * time[:, None, None] + phase)
+            )
             for size, phase in zip((_PLACE_M, _TURN), self._phases, strict=True)
         )
         pose = angles_to_pose(self._angles(np.clip(time, 0, self._ends)))
