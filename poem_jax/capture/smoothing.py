@@ -219,12 +219,12 @@ def _moving(hand: HandResult, model: HandModel) -> MovingHand | None:
     """Return a result as a hand that can move, in float64."""
     if hand.joints_world is None:
         return None
-    expected = None if hand.expected_world is None else np.asarray(hand.expected_world, np.float64)
+    joints, expected = np.asarray(hand.joints_world, np.float64), hand.expected_world
     if hand.pose is not None:
-        return ModelHand.posed(model, hand.pose, hand.shape, hand.translation, expected)
+        offsets = None if expected is None else expected - joints
+        return ModelHand.posed(model, hand.pose, hand.shape, hand.translation, offsets)
     carried = [hand.vertices_world, hand.root_world[None]]
     carried += [] if expected is None else [expected]
-    joints = np.asarray(hand.joints_world, np.float64)
     return MeshHand(joints, np.concatenate(carried).astype(np.float64))
 
 
@@ -243,8 +243,8 @@ def _result(seen: HandResult, moved: MovingHand | None) -> HandResult:
     if isinstance(moved, ModelHand):
         return seen._replace(
             vertices_world=_single(moved.mesh.vertices),
-            joints_world=_single(moved.joints),
-            root_world=_single(moved.joints[ROOT_JOINT]),
+            joints_world=_single(moved.mesh.joints),
+            root_world=_single(moved.mesh.joints[ROOT_JOINT]),
             pose=_single(moved.pose),
             shape=_single(moved.shape),
             translation=_single(moved.translation),

@@ -73,12 +73,12 @@ class CausalFilter(Generic[Hand]):
         if state is None or time_s - state[0] > config.gap_s + 1e-6:
             self._noise = FrameNoise()
             self._trend = np.zeros(3), 0.0
-            self.noise_m = min(most, self._noise.update(time_s, seen.joints))
+            self.noise_m = min(most, self._noise.update(time_s, seen.markers))
             self._state = time_s, seen
             return seen
         last_s, hand = state
-        self.noise_m = min(most, self._noise.update(time_s, seen.joints))
-        share = self._share(time_s - last_s, seen.joints - hand.joints)
+        self.noise_m = min(most, self._noise.update(time_s, seen.markers))
+        share = self._share(time_s - last_s, seen.markers - hand.markers)
         self._state = time_s, hand.towards(seen, share)
         return self._state[1]
 
