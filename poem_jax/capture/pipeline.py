@@ -16,14 +16,12 @@ from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network
 from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
 from poem_jax.capture.report import Clock
-from poem_jax.capture.smoothing import Smoother, Smoothing
+from poem_jax.capture.smoothing import OFF, Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
 from poem_jax.hand.model import HandModel
 from poem_jax.io.writable import check_folder_is_writable
-
-NO_SMOOTHING = Smoothing()
 
 
 def reconstruct(
@@ -35,7 +33,7 @@ def reconstruct(
     network: Network | None = None,
     hand: HandModel | None = None,
     detector: str | None = None,
-    smoothing: Smoothing = NO_SMOOTHING,
+    smoothing: Smoothing = OFF,
     meshes: bool | None = None,
     formats: frozenset[Format] = DEFAULT_FORMATS,
     progress: bool = True,
@@ -95,7 +93,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smoothing: Smoothing = NO_SMOOTHING,
+    smoothing: Smoothing = OFF,
     detector: str | None = None,
     meshes: bool | None = None,
     formats: frozenset[Format] = DEFAULT_FORMATS,

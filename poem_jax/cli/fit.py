@@ -51,7 +51,7 @@ class Fit:
     mano: OptionalFile = None
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
-    """Hold the frames of a take together: less tremble, and hands that are not seen for a moment are bridged."""
+    """Hold the frames of a take together: hands tremble less, and are bridged where unseen for a moment."""
     causal: Flag = False
     """Smooth by what came before alone, as a live picture has to."""
     bridge: Bridge = None

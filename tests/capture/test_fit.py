@@ -16,6 +16,7 @@ from poem_jax.capture.fit import _windows, fit_hands, hands_of
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.pipeline import fit, reconstruct
+from poem_jax.capture.smoothing import Smoothing
 from poem_jax.capture.take import Take, make_take, read_keypoint_take, read_take
 from poem_jax.cli import main
 from poem_jax.data.capture_folder import FramePaths
@@ -280,6 +281,8 @@ def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
     assert "a fit has no weights" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--mano", "hand.npz"]) == 2
     assert "for --engine fit" in capsys.readouterr().err
+    assert main([*arguments, str(tmp_path / "out"), "--bridge", "0.1"]) == 2
+    assert "--bridge goes with --smooth" in capsys.readouterr().err
 
 
 def test_of_both_engines_the_better_one_is_taken(files, fitted, tmp_path):
@@ -410,7 +413,9 @@ def test_smoothing_from_the_command_line(files, fitted, tmp_path):
     keypoints, rig, _ = files
     out = tmp_path / "out"
     assert main(["fit", str(keypoints), "--rig", str(rig), "--out", str(out), "--smooth"]) == 0
-    assert json.loads((out / "report.json").read_text())["smooth"] is True
+    said = json.loads((out / "report.json").read_text())["smoothing"]
+    assert (said["mode"], said["bridge_s"], said["bridged_hands"]) == ("offline", 0.2, 0)
+    assert 0 < said["jitter_after_mm"] <= 1.01 * said["jitter_before_mm"]
     smooth = np.load(out / "prediction.npz")
     assert smooth["valid"].all()
     moved = np.linalg.norm(smooth["joints_world"] - fitted.arrays["joints_world"], axis=-1)
@@ -450,7 +455,8 @@ def test_takes_of_any_length_share_compiled_programs(take, tmp_path, compilation
 @pytest.mark.parametrize("smooth", [False, True])
 def test_a_long_take_is_fitted_group_by_group_with_one_shape(take, tmp_path, truth, smooth):
     count = 2 * FRAMES_TOGETHER + 9
-    written = fit(longer(take, count), tmp_path, progress=False, smooth=smooth)
+    smoothing = Smoothing("offline" if smooth else "off")
+    written = fit(longer(take, count), tmp_path, progress=False, smoothing=smoothing)
     arrays = written.arrays
     assert arrays["frames"].tolist() == [f"{frame:04d}" for frame in range(count)]
     assert arrays["valid"].all()
