@@ -174,7 +174,7 @@ def write_videos(folder: Path, rig: Rig) -> None:
     for name in rig.names:
         noise = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8)
         image = cv2.resize(noise, SIZE_WH, interpolation=cv2.INTER_CUBIC)
-        writer = cv2.VideoWriter(str(folder / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, SIZE_WH)
+        writer = cv2.VideoWriter(str(folder / f"{name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, SIZE_WH)
         for frame in range(FRAMES):
             writer.write(np.roll(image, frame, axis=1))
         writer.release()
