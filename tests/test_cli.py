@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from poem_jax.capture.demo import demo_folder
 from poem_jax.cli import USAGE_ERROR, main
+from tests.one_hand.capture import one_hand_folder
 
 
 @pytest.fixture(autouse=True)
@@ -43,8 +43,17 @@ def test_demo(tmp_path, capsys, checkpoint):
 
 def test_reconstruct(tmp_path, capsys, checkpoint):
     out = tmp_path / "out"
-    rig, boxes = demo_folder() / "rig.json", demo_folder() / "boxes.npz"
-    command = ["reconstruct", str(demo_folder()), "--rig", str(rig), "--boxes", str(boxes), "--out", str(out)]
+    rig, boxes = one_hand_folder() / "rig.json", one_hand_folder() / "boxes.npz"
+    command = [
+        "reconstruct",
+        str(one_hand_folder()),
+        "--rig",
+        str(rig),
+        "--boxes",
+        str(boxes),
+        "--out",
+        str(out),
+    ]
     assert main([*command, "--checkpoint", str(checkpoint)]) == 0
     assert "1 of 1 hands in 1 frames" in capsys.readouterr().out
     with np.load(out / "prediction.npz") as arrays:
@@ -60,7 +69,7 @@ def test_reconstruct(tmp_path, capsys, checkpoint):
 )
 def test_an_empty_option_is_not_the_folder_that_one_is_in(tmp_path, monkeypatch, capsys, empty, what):
     monkeypatch.chdir(tmp_path)
-    assert main(["reconstruct", str(demo_folder()), *empty]) == USAGE_ERROR
+    assert main(["reconstruct", str(one_hand_folder()), *empty]) == USAGE_ERROR
     assert capsys.readouterr().err == f"poem: error: {what}: is a shell variable unset?\n"
     assert not list(tmp_path.iterdir())
 

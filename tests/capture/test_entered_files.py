@@ -5,9 +5,9 @@ import threading
 from pathlib import Path
 
 import poem_jax
-from poem_jax.capture.demo import demo_folder
 from poem_jax.capture.pipeline import reconstruct
 from poem_jax.capture.take import read_take
+from tests.one_hand.capture import one_hand_folder
 
 PACKAGE = Path(poem_jax.__file__).parent
 MAX_FILES = 25
@@ -20,7 +20,7 @@ def test_reconstruct_enters_few_files_of_capture_and_models(tmp_path):
         if event == "call" and frame.f_code.co_name != "<module>":
             entered.add(frame.f_code.co_filename)
 
-    capture = demo_folder()
+    capture = one_hand_folder()
     sys.setprofile(note)
     threading.setprofile(note)
     try:
