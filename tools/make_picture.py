@@ -79,7 +79,9 @@ def in_space(rig: Rig, found: Found, frame: int, phase: float) -> np.ndarray:
     """Draw the hands as the camera that goes round sees them."""
     azimuth = np.radians(_SWING_DEG) * np.sin(2 * np.pi * phase)
     elevation = np.radians(_ELEVATION_DEG)
-    back = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    back = np.array(
+        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
     right = unit_vectors(np.cross(-back, [0.0, 0.0, 1.0]))
     R = np.stack([right, np.cross(-back, right), -back])
     scale = 2
@@ -90,7 +92,9 @@ def in_space(rig: Rig, found: Found, frame: int, phase: float) -> np.ndarray:
         cam = (points - _AIM) @ R.T + [0, 0, _DISTANCE_M]
         focal = scale * _FOCAL_PX * 0.5
         depth = np.maximum(cam[:, 2], 0.05)
-        return np.column_stack([focal * cam[:, 0] / depth + width / 2, focal * cam[:, 1] / depth + height / 2, depth])
+        return np.column_stack(
+            [focal * cam[:, 0] / depth + width / 2, focal * cam[:, 1] / depth + height / 2, depth]
+        )
 
     def lines(paths: np.ndarray, color: tuple[int, int, int]) -> None:
         for path in paths:
@@ -152,14 +156,18 @@ def main() -> None:
     for frame in range(count):
         phase = frame / count
         swept = 0.5 - 0.56 * np.cos(2 * np.pi * phase)
-        tiles = [tile(rig, v, video[frame], found, frame, np.clip(swept, 0, 1)) for v, video in enumerate(videos)]
+        tiles = [
+            tile(rig, v, video[frame], found, frame, np.clip(swept, 0, 1)) for v, video in enumerate(videos)
+        ]
         rows = [join(tiles[:2], axis=1), join(tiles[2:], axis=1)]
         whole = join([join(rows, axis=0), in_space(rig, found, frame, phase)], axis=1)
         frames.append(np.ascontiguousarray(whole[..., ::-1]))
     animation = cv2.Animation()
     animation.frames, animation.durations = frames, [round(1000 / FRAMES_PER_SECOND)] * count
     cv2.imwriteanimation(str(arguments.picture), animation, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    print(f"{arguments.picture}: {arguments.picture.stat().st_size / 1e6:.2f} MB, {frames[0].shape[1::-1]} pixels")
+    print(
+        f"{arguments.picture}: {arguments.picture.stat().st_size / 1e6:.2f} MB, {frames[0].shape[1::-1]} pixels"
+    )
 
 
 def join(pictures: list[np.ndarray], axis: int) -> np.ndarray:

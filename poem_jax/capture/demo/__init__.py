@@ -56,18 +56,18 @@ def demo_truth() -> Truth:
     return Truth(sides, vertices, joints)
 
 
-def demo_score(arrays: Mapping[str, Array], hand_sides: Sequence[str]) -> DemoScore:
+def demo_score(arrays: Mapping[str, Array], hand_names: Sequence[str]) -> DemoScore:
     """Compare a reconstruction of the demo with the truth; a hand is compared with the true one of its side.
 
     Args:
         arrays: `vertices_world` and `joints_world` as in `prediction.npz`; NaN = not found.
-        hand_sides: Of its hands.
+        hand_names: Of its hands, as in `report.json`: their sides, numbered where one comes twice.
 
     Raises:
         ValueError: No true hand was found in any frame.
     """
     truth = demo_truth()
-    pairs = [(hand_sides.index(side), h) for h, side in enumerate(truth.sides) if side in hand_sides]
+    pairs = [(hand_names.index(side), h) for h, side in enumerate(truth.sides) if side in hand_names]
     ours, true = (list(index) for index in zip(*pairs, strict=True)) if pairs else ([], [])
     joints, vertices = (arrays[name][:, ours] for name in ("joints_world", "vertices_world"))
     found = np.isfinite(vertices).all((-1, -2))
