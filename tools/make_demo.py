@@ -5,7 +5,6 @@ the true hands. Takes a few minutes; pictures and truth are the same on every ru
 """
 
 import argparse
-import os
 from pathlib import Path
 
 import cv2
@@ -19,14 +18,12 @@ from poem_jax.synthetic.desk.motion import SHAPE, SIDES, hands_at
 from poem_jax.synthetic.desk.take import desk_pictures
 
 CALIBRATION = "calibration.toml"
-BITS_PER_SECOND = 1_400_000
-# MPEG-4 part 2: every OpenCV reads and writes it. These go to its encoder, which reads them from here.
-os.environ["OPENCV_FFMPEG_WRITER_OPTIONS"] = f"b;{BITS_PER_SECOND}|g;15"
 
 
 def write_videos(out: Path) -> None:
     """Draw all frames; every camera's go to its own file."""
     names = desk_rig().names
+    # MPEG-4 part 2: every OpenCV reads and writes it; some 7 kB a frame here.
     code = cv2.VideoWriter.fourcc(*"mp4v")
     videos = [cv2.VideoWriter(str(out / f"{name}.mp4"), code, FRAMES_PER_SECOND, SIZE_WH) for name in names]
     for frame in tqdm(range(len(frame_times())), unit="frame"):

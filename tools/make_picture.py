@@ -14,7 +14,7 @@ import numpy as np
 from poem_jax.capture.demo import demo_folder, demo_truth
 from poem_jax.data.lens import project_raw
 from poem_jax.geometry.rig import Rig
-from poem_jax.geometry.transforms import transform_points, unit_vectors
+from poem_jax.geometry.transforms import unit_vectors
 from poem_jax.hand.template import default_hand
 from poem_jax.render.zbuffer import NO_FACE, rasterise
 from poem_jax.synthetic.desk.cameras import FRAMES_PER_SECOND, desk_rig
@@ -165,9 +165,8 @@ def main() -> None:
     animation = cv2.Animation()
     animation.frames, animation.durations = frames, [round(1000 / FRAMES_PER_SECOND)] * count
     cv2.imwriteanimation(str(arguments.picture), animation, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    print(
-        f"{arguments.picture}: {arguments.picture.stat().st_size / 1e6:.2f} MB, {frames[0].shape[1::-1]} pixels"
-    )
+    megabytes = arguments.picture.stat().st_size / 1e6
+    print(f"{arguments.picture}: {megabytes:.2f} MB, {frames[0].shape[1::-1]} pixels")
 
 
 def join(pictures: list[np.ndarray], axis: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The take that ships: its videos, calibration and truth belong together, and the score means what it says."""
+"""The take that ships: videos, calibration and truth belong together, and the score means what it says."""
 
 import cv2
 import numpy as np

@@ -24,11 +24,11 @@ SIDES = ("left", "right")
 SHAPE = np.array([0.3, 0.2, 0.2, 0.0, 0.2, 0.0, 0.0, 0.3, 0.0, 0.0], np.float32)
 """The person's hands, in the shape coefficients of the shipped hand."""
 
-Posture = dict[str, tuple[float, ...]]
+Posture = dict[str, tuple[int, ...]]
 """Degrees. Per long finger: flexion and abduction of the knuckle, flexion of the next two joints. For the
 thumb: flexion, abduction and twist of its base, flexion of the next two joints."""
 
-_CURLED = (76.0, 0.0, 94.0, 52.0)
+_CURLED = (76, 0, 94, 52)
 _RELAXED: Posture = {
     "index": (16, 3, 22, 12),
     "middle": (22, 0, 28, 14),
@@ -75,9 +75,9 @@ class _Part(NamedTuple):
     """What one hand does, as a right hand: rows are equally spaced in time."""
 
     postures: tuple[Posture, ...]
-    place_cm: tuple[tuple[float, float, float], ...]
+    place_cm: tuple[tuple[int, int, int], ...]
     """Of the wrist, in the world."""
-    turn_deg: tuple[tuple[float, float, float], ...]
+    turn_deg: tuple[tuple[int, int, int], ...]
     """From fingers up and palm away from the person: turn about the fingers (positive: the palm towards the
     other hand), tip of the fingers (positive: towards the person), lean (positive: outwards)."""
 

@@ -19,7 +19,7 @@ def _desk() -> list[Surface]:
     left, near, width, depth, thick = -0.80, -0.27, 1.60, 0.86, 0.035
     top = sheet((left, near, 0), (width, 0, 0), (0, depth, 0), 0.0125, Material.WOOD, _WOOD)
     middle = (left + width / 2, near + depth / 2, -thick / 2 - 0.0005)
-    return [top, box(middle, (width / 2, depth / 2, thick / 2), 0, Material.WOOD, _WOOD, step=0.06)]
+    return [top, box(middle, (width / 2, depth / 2, thick / 2), 0.0, Material.WOOD, _WOOD, step=0.06)]
 
 
 def _mug() -> list[Surface]:
@@ -63,9 +63,9 @@ def _notebook() -> list[Surface]:
     paper = sheet(
         (0.20, 0.16, 0.0012), (0.20, 0.035, 0), (-0.05, 0.285, 0), 0.02, Material.PAPER, (0.80, 0.79, 0.75)
     )
-    cover = box((0.36, 0.22, 0.009), (0.074, 0.105, 0.008), 14, Material.PAPER, (0.30, 0.035, 0.030))
-    band = box((0.405, 0.231, 0.0095), (0.004, 0.1055, 0.0083), 14, Material.PAPER, (0.03, 0.03, 0.035))
-    pencil = box((0.33, 0.215, 0.0215), (0.0036, 0.085, 0.0036), -28, Material.GLAZE, (0.78, 0.42, 0.03))
+    cover = box((0.36, 0.22, 0.009), (0.074, 0.105, 0.008), 14.0, Material.PAPER, (0.30, 0.035, 0.030))
+    band = box((0.405, 0.231, 0.0095), (0.004, 0.1055, 0.0083), 14.0, Material.PAPER, (0.03, 0.03, 0.035))
+    pencil = box((0.33, 0.215, 0.0215), (0.0036, 0.085, 0.0036), -28.0, Material.GLAZE, (0.78, 0.42, 0.03))
     return [paper, cover, band, pencil]
 
 
@@ -83,7 +83,8 @@ def _shell() -> list[Surface]:
         ((half, front, low), (0, back - front, 0)),
     ):
         walls.append(sheet(origin, along, (0, 0, high - low), step, Material.WALL, _WALL))
-    skirting = box((0, back + 0.012, low + 0.05), (half, 0.011, 0.05), 0, Material.GLAZE, (0.70, 0.69, 0.66))
-    shelf = box((-0.95, back + 0.16, -0.2), (0.35, 0.15, 0.54), 0, Material.WOOD, (0.50, 0.47, 0.42))
-    cushion = box((0.95, back + 0.3, -0.45), (0.3, 0.26, 0.28), 8, Material.KNIT, (0.15, 0.165, 0.15))
+    white = (0.70, 0.69, 0.66)
+    skirting = box((0, back + 0.012, low + 0.05), (half, 0.011, 0.05), 0.0, Material.GLAZE, white)
+    shelf = box((-0.95, back + 0.16, -0.2), (0.35, 0.15, 0.54), 0.0, Material.WOOD, (0.50, 0.47, 0.42))
+    cushion = box((0.95, back + 0.3, -0.45), (0.3, 0.26, 0.28), 8.0, Material.KNIT, (0.15, 0.165, 0.15))
     return [*walls, skirting, shelf, cushion]

@@ -60,12 +60,12 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 
 
 def sheet(
-    origin: Array | Sequence[float],
-    u: Array | Sequence[float],
-    v: Array | Sequence[float],
+    origin: Array | Sequence[float | int],
+    u: Array | Sequence[float | int],
+    v: Array | Sequence[float | int],
     step: float,
     material: Material,
-    color: Array | Sequence[float],
+    color: Array | Sequence[float | int],
 ) -> Surface:
     """Return a parallelogram in cells of about `step`, facing u x v; `local` is along u, v in metres."""
     u, v = np.asarray(u, float), np.asarray(v, float)
@@ -84,11 +84,11 @@ def tube(rings: Float[Array, "ring side 3"], material: Material, color: Array, l
 
 
 def box(
-    center: Sequence[float],
-    half: Sequence[float],
+    center: Sequence[float | int],
+    half: Sequence[float | int],
     yaw_deg: float,
     material: Material,
-    color: Array | Sequence[float],
+    color: Array | Sequence[float | int],
     step: float = 0.02,
 ) -> Surface:
     """Return an upright box with sharp edges, its sides in cells of about `step`."""

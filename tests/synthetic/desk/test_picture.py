@@ -11,8 +11,8 @@ from poem_jax.synthetic.desk.motion import SIDES, hands_at
 from poem_jax.synthetic.desk.picture import SUPERSAMPLE
 from poem_jax.synthetic.desk.take import desk_pictures
 
-FRAME = 18
-VIEWS = (1, 3)
+FRAME = 15
+VIEWS = (2, 3)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def test_the_true_hands_are_what_is_drawn(pictures, true_depths):
         shown = np.isfinite(nearest)
         behind = picture.depth[shown] - nearest[shown]
         # Fine faces bulge over coarse ones, and beside a coarse edge there is what lies behind it.
-        assert np.mean(np.abs(behind) < 0.0015) > 0.93
-        assert np.mean(behind > 0.003) < 0.005
+        assert np.mean(np.abs(behind) < 0.0025) > 0.93
+        assert np.mean(behind > 0.004) < 0.01
 
 
 def test_the_nearer_hand_hides_the_other(pictures, true_depths):
@@ -51,7 +51,7 @@ def test_the_nearer_hand_hides_the_other(pictures, true_depths):
     assert both.sum() > 500, "choose a frame in which one hand is seen before the other"
     for picture, hands, overlap in zip(pictures, true_depths, both, strict=True):
         if overlap.any():
-            assert np.mean(picture.depth[overlap] < hands.min(0)[overlap] + 0.0015) > 0.99
+            assert np.mean(picture.depth[overlap] < hands.min(0)[overlap] + 0.003) > 0.99
 
 
 def test_pictures_are_the_same_on_every_run(pictures):
