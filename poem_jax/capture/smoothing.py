@@ -68,8 +68,8 @@ class Smoother:
         Args:
             take: The sides of its hands.
             smoothing: What to do.
-            models: The hand models that belong to pose, shape and place, where an engine gives them; None = it gives
-                none.
+            models: The hand models that belong to pose, shape and place, where an engine gives them; None =
+                it gives none.
         """
         self._smoothing = smoothing
         self._models = [None if models is None else models.of(side) for side in take.hand_sides]
