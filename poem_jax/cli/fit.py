@@ -40,7 +40,8 @@ class Fit:
     out: Folder
     """Folder for the results; files of the same name are replaced."""
     rig: OptionalFile = None
-    """Calibration; without it rig.json or calibration/rig.json in the folder of --images or of KEYPOINTS."""
+    """Calibration of any format that is read; without it the one in the folder of --images or of KEYPOINTS,
+    or in its calibration/."""
     max_hands: int = 2
     """Hands that are looked for in a capture's images."""
     video: Flag = False
