@@ -72,8 +72,8 @@ def customary_metres(
         tried = " and ".join(f"{d:.3g} m if in {unit}s" for unit, d in zip(customs, apart, strict=True))
         raise ValueError(
             f"{path}: {kind} does not say its unit, and its cameras would stand {tried} apart: say it "
-            "by `poem calibration convert IN rig.json --unit UNIT` (metre, centimetre, millimetre, inch, or the "
-            "metres of one unit)"
+            "by `poem calibration convert IN rig.json --unit UNIT` (metre, centimetre, millimetre, inch, or "
+            "the metres of one unit)"
         )
     unit = believed[0]
     _log.warning(

@@ -82,7 +82,8 @@ class Convert:
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Name of the format to write; without it what the ending of OUT says."""
     unit: Annotated[str | None, tyro.conf.arg(metavar="UNIT")] = None
-    """Unit of the lengths in IN, whatever it says: metre, centimetre, millimetre, inch, or the metres of one."""
+    """Unit of the lengths in IN, whatever it says: metre, centimetre, millimetre, inch, or the metres of
+    one unit."""
     image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H")] = None
     """Width and height of all images, for formats that do not hold them."""
     debug: Flag = False
