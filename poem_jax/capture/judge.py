@@ -95,8 +95,8 @@ def _measured(frame: Frame, rig: Rig) -> tuple[HandResult, ...]:
     hands = list(frame.hands)
     if not found:
         return frame.hands
-    points = [(hands[i].joints_world, _expected(hands[i])) for i in found]
-    flat = np.reshape(points, (-1, 3))
+    points = [np.stack([np.asarray(hands[i].joints_world), _expected(hands[i])]) for i in found]
+    flat = np.concatenate(points).reshape(-1, 3)
     pixels = np.stack([project_raw(rig, view, flat)[0] for view in range(rig.num_views)])
     pixels = np.moveaxis(pixels.reshape(rig.num_views, len(found), 2, NUM_JOINTS, 2), 0, 2)
     for index, (joints_px, expected_px) in zip(found, pixels, strict=True):
@@ -109,8 +109,8 @@ def _measured(frame: Frame, rig: Rig) -> tuple[HandResult, ...]:
     return tuple(hands)
 
 
-def _expected(hand: HandResult) -> Array | None:
-    return hand.joints_world if hand.expected_world is None else hand.expected_world
+def _expected(hand: HandResult) -> Array:
+    return np.asarray(hand.joints_world if hand.expected_world is None else hand.expected_world)
 
 
 def _twins(hands: Sequence[HandResult]) -> list[str]:
