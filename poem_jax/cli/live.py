@@ -32,8 +32,8 @@ class Live:
     rig: File
     """Calibration, in any format that is read."""
     source: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DIR|CAMERA=WHAT")]
-    """CAMERA=0 CAMERA=1 ...: devices; CAMERA=rtsp://...: network cameras; CAMERA=a.mp4 ... or a take's folder:
-    played as if it ran now."""
+    """CAMERA=0 CAMERA=1 ...: devices; CAMERA=rtsp://...: network cameras; CAMERA=a.mp4 ..., or a take's
+    folder: played as if it ran now."""
     loop: Flag = False
     """Play a take or videos again and again."""
     engine: Literal["fit", "poem"] = "fit"

@@ -108,9 +108,7 @@ class LiveScene:
         """Let all look at the hands from where they and the cameras are seen best."""
         view: View = initial_view(points_world, np.stack([c.T_cam_from_world for c in self._cameras]))
         first = self._server.initial_camera
-        first.position, first.look_at, first.up = (
-            tuple(map(float, place)) for place in (view.position, view.look_at, view.up)
-        )
+        first.position, first.look_at, first.up = map(np.asarray, (view.position, view.look_at, view.up))
         for client in self._server.get_clients().values():
             camera = client.camera
             camera.position, camera.look_at, camera.up_direction = view.position, view.look_at, view.up

@@ -1,4 +1,4 @@
-"""Cameras that OpenCV opens, by the number of a device or by a URL; a thread each keeps the newest picture."""
+"""Cameras that OpenCV opens, by a device's number or by a URL; a thread each keeps the newest picture."""
 
 import logging
 import os

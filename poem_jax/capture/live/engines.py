@@ -5,7 +5,7 @@ moments that lie a while apart, and held from then on, so that later fits are of
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from poem_jax.fitting.kinematics import KeypointModel, keypoint_model
 from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.typing import Array, Float, Int
+
+if TYPE_CHECKING:
+    from poem_jax.fitting import FitResult
 
 MOMENTS_FOR_SHAPE = 16
 """So many settle a hand's shape."""
@@ -68,8 +71,8 @@ def live_fit(rig: Rig, hands: Hands, detector: str | None = MEDIAPIPE_HANDS) -> 
             assert frame.time_s is not None
             keypoints = ideal_keypoints(rig, frame.keypoints_px[None])[0]
             found = [
-                fit.hand(frame.time_s, *given)
-                for fit, *given in zip(fits, keypoints, frame.confidence, strict=True)
+                fit.hand(frame.time_s, seen, confidence)
+                for fit, seen, confidence in zip(fits, keypoints, frame.confidence, strict=True)
             ]
             yield frame._replace(hands=tuple(found))
 
@@ -99,10 +102,8 @@ class _LiveHandFit:
         """Fit a moment."""
         if np.isfinite(keypoints).all(-1).any(-1).sum() < 2:
             return HandResult(np.zeros(self._rig.num_views, bool), NOT_FITTED)
-        together = (
-            [*self._kept, (keypoints, confidence)] if self._shape is None else [(keypoints, confidence)]
-        )
-        group = tuple(np.stack(arrays) for arrays in zip(*together, strict=True))
+        together = [*self._kept, (keypoints, confidence)]
+        group = np.stack([seen for seen, _ in together]), np.stack([sure for _, sure in together])
         fitted = self._fit(*group, self._shape)
         if self._shape is None and fitted.valid[-1] and time_s - self._kept_s >= _APART_S:
             self._kept, self._kept_s = together, time_s

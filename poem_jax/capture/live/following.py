@@ -117,7 +117,7 @@ class HandFollower:
         score = np.full(keypoints.shape[:2], np.nan)
         for track in self._tracks:
             if track.side is not None and track.found is not None:
-                for view in np.flatnonzero(track.found != NONE):
+                for view in np.flatnonzero(track.found != NONE).tolist():
                     hand = found[view][sightings.number[track.found[view]]]
                     keypoints[track.side, view] = hand.keypoints_px
                     score[track.side, view] = hand.score

@@ -1,4 +1,4 @@
-"""The line of a live picture: the newest moment, its hands, calmed by what came before, out; then the next."""
+"""The line of a live picture: the newest moment, its hands, calmed by those before, out; then the next."""
 
 from collections.abc import Iterator, Sequence
 from typing import Protocol

@@ -6,7 +6,7 @@ at most. What came and went meanwhile is counted as dropped.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -112,5 +112,5 @@ class LiveMoments:
         return living
 
 
-def _time_of(shots: "Sequence[Shot] | dict") -> float:
+def _time_of(shots: Iterable[Shot]) -> float:
     return float(np.median([shot.time_s for shot in shots]))

@@ -1,4 +1,4 @@
-"""How the live line keeps up: moments there were, done and dropped, and how old they are when they come out."""
+"""How the live line keeps up: moments there were, done and dropped, and how old their hands are."""
 
 from collections import deque
 from collections.abc import Callable
@@ -35,9 +35,9 @@ class Figures(NamedTuple):
         if not self.done:
             return f"{self.offered} moments, none done"
         return (
-            f"{self.rate:.1f} moments/s; {self.done} of {self.offered} done, {self.dropped} dropped; latency "
-            f"{self.latency_ms[0]:.0f} ms (95 %: {self.latency_ms[1]:.0f}), {self.behind_ms[0]:.0f} ms (95 %: "
-            f"{self.behind_ms[1]:.0f}) behind the detector"
+            f"{self.rate:.1f} moments/s; {self.done} of {self.offered} done, {self.dropped} dropped; "
+            f"latency {self.latency_ms[0]:.0f} ms (95 %: {self.latency_ms[1]:.0f}); "
+            f"{self.behind_ms[0]:.0f} ms (95 %: {self.behind_ms[1]:.0f}) behind the detector"
         )
 
 
@@ -73,7 +73,7 @@ class Pace:
         return self._since(self._begin_s, 0, 0)
 
     def lap(self, seconds: float) -> Figures | None:
-        """Return what holds since the last call that returned something, `seconds` ago or longer; else None."""
+        """Return what holds since this last returned something, if that is `seconds` ago; else None."""
         if self._clock() - self._lap[0] < seconds:
             return None
         figures = self._since(*self._lap)
@@ -82,12 +82,11 @@ class Pace:
 
     def _since(self, time_s: float, offered: int, done: int) -> Figures:
         count = self._done - done
-        delays = [
-            _quantiles_ms(list(kept)[-count:] if count else [])
-            for kept in (self._latencies_s, self._behind_s)
-        ]
+        kept = (self._latencies_s, self._behind_s)
+        delays = [_quantiles_ms(list(each)[-count:] if count else []) for each in kept]
         there_were = self._offered - offered
-        return Figures(self._clock() - time_s, there_were, count, there_were - count, *delays)
+        seconds = self._clock() - time_s
+        return Figures(seconds, there_were, count, there_were - count, delays[0], delays[1])
 
 
 def _quantiles_ms(delays_s: list[float]) -> tuple[float, float]:

@@ -66,8 +66,8 @@ def _addresses(texts: Sequence[str], rig: Rig) -> dict[str, str]:
         name, equals, what = text.partition("=")
         if not equals or not what:
             raise ValueError(
-                f"--source must be a folder alone, or {rig.names[0]}=WHAT for each camera (a device's number, "
-                f"a URL, or a video); got {text!r}"
+                f"--source must be a folder alone, or {rig.names[0]}=WHAT for each camera (the number of a "
+                f"device, a URL, or a video); got {text!r}"
             )
         if name_key(name) not in known:
             raise ValueError(

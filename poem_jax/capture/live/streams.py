@@ -39,9 +39,7 @@ def check_port_is_free(host: str, port: int, option: str) -> None:
             pass
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ValueError(
-            f"port {port} of {host} cannot be listened at ({reason}): give another {option}"
-        ) from error
+        raise ValueError(f"port {port} of {host} cannot be used ({reason}): give another {option}") from error
 
 
 class UdpStream:

@@ -36,9 +36,8 @@ class LiveViewer:
         )
         if self._scene.wants_pictures:
             views = zip(frame.images, self._gallery.maps, strict=True)
-            self._scene.show_pictures(
-                [None if image is None else take_picture(image, at) for image, at in views]
-            )
+            pictures = [None if image is None else take_picture(image, at) for image, at in views]
+            self._scene.show_pictures(pictures)
 
     def tell(self, figures: Figures) -> None:
         """Show how the line keeps up."""
