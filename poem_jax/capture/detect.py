@@ -198,7 +198,7 @@ def _hand_boxes(
     hands = associate_hands(found, rig, max_hands=max_hands, frame_names=names)
     for warning in hands.warnings:
         _log.warning("%s", warning)
-    keypoints = _within(hands.keypoints_px, rig)
+    keypoints = within_images(hands.keypoints_px, rig)
     boxes = boxes_from_keypoints(keypoints)
     time_s = None if None in times else np.array(times, float)
     return HandBoxes(
@@ -206,10 +206,10 @@ def _hand_boxes(
     )
 
 
-def _within(
+def within_images(
     keypoints_px: Float[Array, "frame hand view 21 2"], rig: Rig
 ) -> Float[Array, "frame hand view 21 2"]:
-    """Return the key points with guesses beyond the image's border unseen."""
+    """Return raw pixels with key points that are guessed beyond the image's border unseen (NaN)."""
     inside = (keypoints_px >= 0) & (keypoints_px <= rig.size_wh[:, None])
     return np.where(inside.all(-1, keepdims=True), keypoints_px, np.nan)
 

@@ -134,7 +134,7 @@ def try_fit(
     fitted, trusted = [], []
     for index, side in enumerate(take.hand_sides):
         given, model = (keypoints[:, index], confidence[:, index]), _keypoint_models(hands, side, offsets)[0]
-        fitted.append(_run(model, *given, times_of(group), take.rig, config, None))
+        fitted.append(fit_group(model, *given, times_of(group), take.rig, config, None))
         trusted.append(joint_confidence(fitted[-1], *given, take.rig))
     yield from _with_results(group, range(len(group)), fitted, trusted)
 
@@ -145,7 +145,7 @@ def _with_results(
     """Give the frames whose turn it is what came of their hands."""
     for turn in turns:
         pairs = zip(fitted, trusted, strict=True)
-        yield group[turn]._replace(hands=tuple(_result(fit, turn, trust) for fit, trust in pairs))
+        yield group[turn]._replace(hands=tuple(fitted_hand(fit, turn, trust) for fit, trust in pairs))
 
 
 def _keypoint_models(
@@ -207,7 +207,7 @@ class _HandFit:
     def fit(self, keypoints: Array, confidence: Array, time_s: Array, rig: Rig) -> "FitResult":
         """Fit a group of frames: key points (frame, view, 21, 2), their confidence, and their times."""
         own, other = (
-            _run(model, keypoints, confidence, time_s, rig, self._config, shape)
+            fit_group(model, keypoints, confidence, time_s, rig, self._config, shape)
             for model, shape in zip(self._models, self._shapes, strict=True)
         )
         enough = own.valid.sum() >= _FRAMES_FOR_SHAPE
@@ -224,7 +224,7 @@ class _HandFit:
         return warnings
 
 
-def _run(
+def fit_group(
     model: "KeypointModel",
     keypoints: Array,
     confidence: Array,
@@ -232,8 +232,20 @@ def _run(
     rig: Rig,
     config: "FitConfig",
     shape: Array | None,
+    together: int = FRAMES_TOGETHER,
 ) -> "FitResult":
-    """Fit a group of frames, padded to the one size for which there is a program; None = unknown shape."""
+    """Fit a hand to a group of frames, padded to a size for which there is a program.
+
+    Args:
+        model: The hand.
+        keypoints: (frame, view, 21, 2), pixels without distortion; NaN = unseen.
+        confidence: Of the key points (frame, view, 21).
+        time_s: When the frames were taken.
+        rig: The cameras.
+        config: Of the fit.
+        shape: Of the hand (10,); None = unknown, one for all frames.
+        together: The group is padded to a multiple of it.
+    """
     import jax
 
     from poem_jax.fitting import Observations, fit_take
@@ -242,13 +254,20 @@ def _run(
     if shape is not None:
         lm = dataclasses.replace(config.lm, shape_mode=ShapeMode.GIVEN)
         config = dataclasses.replace(config, lm=lm)
-    padded = (padded_frames(keypoints), padded_frames(confidence))
+    padded = (padded_frames(keypoints, together), padded_frames(confidence, together))
     observations = Observations(*padded, rig.K, rig.T_cam_from_world)
-    fitted = jax.device_get(fit_take(model, observations, shape, config, padded_times(time_s)))
+    fitted = jax.device_get(fit_take(model, observations, shape, config, padded_times(time_s, together)))
     return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
 
 
-def _result(fitted: "FitResult", turn: int, trusted: Array) -> HandResult:
+def fitted_hand(fitted: "FitResult", turn: int, trusted: Array) -> HandResult:
+    """Return what a fit says of the hand in frame number `turn`, or why it says nothing.
+
+    Args:
+        fitted: The hand over some frames.
+        turn: The frame.
+        trusted: `fit_trust.joint_confidence` of the fit.
+    """
     used = fitted.inlier_mask[turn].any(-1)
     if not fitted.valid[turn]:
         return HandResult(used, NOT_FITTED)

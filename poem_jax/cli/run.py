@@ -15,6 +15,7 @@ from poem_jax.cli.export_torch import ExportTorch
 from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.inspect import Inspect
+from poem_jax.cli.live import Live
 from poem_jax.cli.messages import set_up_logging
 from poem_jax.cli.pack import Pack
 from poem_jax.cli.reconstruct import Reconstruct
@@ -27,6 +28,7 @@ Command = (
     | Reconstruct
     | Fit
     | Detect
+    | Live
     | Calibration
     | Retarget
     | Inspect
@@ -41,6 +43,7 @@ _Commands = (
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
+    | Annotated[Live, tyro.conf.subcommand("live")]
     | Annotated[Retarget, tyro.conf.subcommand("retarget")]
     | Annotated[Calibration, tyro.conf.subcommand("calibration")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]

@@ -129,6 +129,12 @@ class HandTracker:
         return hands
 
 
+def compile_programs() -> None:
+    """Compile all that `find_hands` and the trackers may need, so that no image waits for it."""
+    for program in (_palm_program(), _landmark_program()):
+        program.compile()
+
+
 def _check(images: Sequence[Any], max_hands: int) -> None:
     if max_hands < 1:
         raise ValueError(f"`max_hands` must be 1 or more; got {max_hands}")
@@ -207,6 +213,12 @@ class _Program:
         else:
             parts = [run(group) for group in groups]
         return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+
+    def compile(self) -> None:
+        """Compile it for one group of pictures, and for several side by side."""
+        on_cpu = jax.default_backend() == "cpu"
+        for beside_others in (False, True) if on_cpu else (False,):
+            self._program(1 if on_cpu else _BATCH, beside_others)
 
     def _program(self, number: int, beside_others: bool) -> Any:
         """Return the compiled program, that takes one thread where several run side by side."""
