@@ -90,7 +90,7 @@ def explain(
         likely = _likely(given, trials, size, joint_orders)
         if len(likely) != 1:
             found = judge_views(rig, every, time_s=time_s)
-            return [f for f in found if f.name not in UNEXPLAINED] or [_unexplained(given, likely)]
+            return [f for f in found if f.name not in UNEXPLAINED] or [_unexplained(given, likely, found)]
         (trial,) = likely
         assert trial.hypothesis is not None
         share = f"{given.agreeing:.0%} of the key points fit each other as given, {trial.agreeing:.0%} so"
@@ -182,12 +182,13 @@ def _unit(scale: float) -> Finding:
     return Finding("unit of the rig", evidence + (f" ({unit}?)" if unit else ""), fix)
 
 
-def _unexplained(given: _Trial, likely: list[_Trial]) -> Finding:
+def _unexplained(given: _Trial, likely: list[_Trial], views: list[Finding]) -> Finding:
     causes = "; or ".join(trial.hypothesis.cause for trial in likely if trial.hypothesis is not None)
     return Finding(
         "views disagree",
         f"the rig does not fit the key points: only {given.agreeing:.0%} of them fit what the views "
-        f"triangulate, and {'it may be that ' + causes if causes else 'no known mistake explains it'}",
+        f"triangulate, and {'it may be that ' + causes if causes else 'no known mistake explains it'}"
+        + "".join(f"; {finding.evidence}" for finding in views),
         "check that K belongs to the images as they are, that x_cam = R @ x_world + t in OpenCV axes, that "
         "the key points are in pixels of the raw images, and that they are in the rig's order of cameras",
         fatal=False,
