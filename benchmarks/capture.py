@@ -4,10 +4,9 @@ A row is a function that prints what it measured; `ROWS` lists them.
 
     detection   frames a second of the search for hands in four real videos (--data: the folder `data` of the
                 reference material, with caliscope_4cam_video and caliscope_4cam_hands)
-    fit         key points given, engine fit: 4 cameras, two hands, the whole way from a take to its files,
-                without images, so that no overlay is drawn
-    memory      memory of a search, then of a fit, after 200 and after 2,000 frames of a synthetic take
+    fit         frames a second of the fit of 4 cameras and two hands, key points given, files written
     smoothing   how much hands tremble, and how late they are, before they are smoothed and after
+    memory      memory of a search, then of a fit, after 200 and after 2,000 frames of a synthetic take
 """
 
 import argparse
@@ -28,7 +27,7 @@ from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_b
 from poem_jax.capture.detect import detect_hands
 from poem_jax.capture.detections import SearchFile
 from poem_jax.capture.moments import find_moments
-from poem_jax.capture.pipeline import fit, reconstruct
+from poem_jax.capture.pipeline import fit
 from poem_jax.capture.take import Take, make_take, read_keypoint_take
 from poem_jax.data.capture_folder import FramePaths
 from poem_jax.data.lens import project_raw
@@ -41,9 +40,9 @@ from poem_jax.synthetic.keypoint_takes import IMAGE_WH, draw_keypoint_take
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FRAMES, EARLY = 2000, 200
+FIT_FRAMES = 640
+HANDS = ("right", "left")
 SIZE_WH = (320, 240)
-FIT_FRAMES, FIT_VIEWS, FIT_NOISE_PX = 640, 4, 2.0
-SIDES = ("right", "left")
 
 
 def detection(data: Path) -> None:
@@ -70,37 +69,34 @@ def detection(data: Path) -> None:
         )
 
 
+def fit_row(_: Path) -> None:
+    """Fit key points that are given, the whole way to the files, and say where the time goes.
+
+    There are no images, so that no overlay is drawn; what compiles does so in a shorter take before.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        fit(keypoint_take(128), Path(folder) / "first", progress=False)
+        written = fit(keypoint_take(FIT_FRAMES), Path(folder) / "out", progress=False)
+        spent = written.report["timings_s"]
+    total = spent.pop("total")
+    shares = ", ".join(f"{name} {100 * s / total:.0f} %" for name, s in spent.items() if s > 0.01 * total)
+    print(f"fit: {FIT_FRAMES / total:.1f} frames/s of 4 cameras and {len(HANDS)} hands ({shares})")
+
+
 def keypoint_take(num_frames: int) -> Take:
     """Return both hands of a synthetic take in one rig, as key points without images."""
-    drawn = [draw_keypoint_take(default_hand(side), num_frames, FIT_VIEWS, FIT_NOISE_PX, 7) for side in SIDES]
+    drawn = [draw_keypoint_take(default_hand(side), num_frames, 4, 2.0, 7) for side in HANDS]
     rig = Rig(
-        tuple(f"cam_{view}" for view in range(FIT_VIEWS)),
-        np.tile(IMAGE_WH, (FIT_VIEWS, 1)),
+        tuple(f"cam_{view}" for view in range(4)),
+        np.tile(IMAGE_WH, (4, 1)),
         drawn[0].K.astype(np.float64),
-        np.zeros((FIT_VIEWS, 5)),
+        np.zeros((4, 5)),
         drawn[0].T_cam_from_world.astype(np.float64),
     )
     keypoints = np.stack([take.uv_px for take in drawn], 1).astype(np.float64)
     names = tuple(f"{frame:05d}" for frame in range(num_frames))
-    hands = HandBoxes(boxes_from_keypoints(keypoints), SIDES, names, keypoints)
-    return make_take(rig, [FramePaths(name, (None,) * FIT_VIEWS) for name in names], hands)
-
-
-def fit_rate(_: Path) -> None:
-    """Print frames a second of the fit, and where its time goes."""
-    with tempfile.TemporaryDirectory() as folder:
-        reconstruct(keypoint_take(64), Path(folder) / "first", engine="fit", progress=False)
-        written = reconstruct(keypoint_take(FIT_FRAMES), Path(folder) / "out", engine="fit", progress=False)
-        spent = written.report["timings_s"]
-    shares = ", ".join(
-        f"{name} {100 * seconds / spent['total']:.0f} %"
-        for name, seconds in spent.items()
-        if name != "total" and seconds > 0.01 * spent["total"]
-    )
-    print(
-        f"fit: {FIT_FRAMES / spent['total']:.1f} frames/s of {FIT_VIEWS} cameras and {len(SIDES)} hands "
-        f"({shares})"
-    )
+    hands = HandBoxes(boxes_from_keypoints(keypoints), HANDS, names, keypoints)
+    return make_take(rig, [FramePaths(name, (None,) * 4) for name in names], hands)
 
 
 def memory(_: Path) -> None:
@@ -178,7 +174,7 @@ def write_videos(folder: Path, rig: Rig) -> None:
     for name in rig.names:
         noise = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8)
         image = cv2.resize(noise, SIZE_WH, interpolation=cv2.INTER_CUBIC)
-        writer = cv2.VideoWriter(str(folder / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, SIZE_WH)
+        writer = cv2.VideoWriter(str(folder / f"{name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, SIZE_WH)
         for frame in range(FRAMES):
             writer.write(np.roll(image, frame, axis=1))
         writer.release()
@@ -206,7 +202,7 @@ def planted(rig: Rig, turns: Iterator[int]) -> Callable[..., list[list[DetectedH
 
 ROWS: dict[str, Callable[[Path], None]] = {
     "detection": detection,
-    "fit": fit_rate,
+    "fit": fit_row,
     "memory": memory,
     "smoothing": lambda _: smoothing(),
 }

@@ -25,7 +25,7 @@ def number_of(image):
 
 def write_video(path, num_frames=20, rate=10, size_wh=(64, 48), seed=0):
     kind = "MJPG" if path.suffix == ".avi" else "mp4v"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*kind), rate, size_wh)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*kind), rate, size_wh)
     for index in range(num_frames):
         writer.write(picture(index, size_wh, seed))
     writer.release()

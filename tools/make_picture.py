@@ -26,9 +26,9 @@ TILE_WH = (264, 198)
 SPACE_WH = (400, 2 * TILE_WH[1] + 4)
 GAP = 4
 BACKGROUND = (22, 24, 28)
-QUALITY = 62
-_FOCAL_PX, _DISTANCE_M = 2.05 * SPACE_WH[1], 1.15
-_AIM = np.array([0.0, 0.0, 0.20])
+QUALITY = 82
+_FOCAL_PX, _DISTANCE_M = 2.0 * SPACE_WH[1], 1.15
+_AIM = np.array([0.0, 0.02, 0.155])
 _SWING_DEG, _ELEVATION_DEG = 38.0, 20.0
 _LIGHT = unit_vectors(np.array([0.5, -0.7, -0.6]))
 """In the frame of the camera that goes round."""
@@ -90,7 +90,7 @@ def in_space(rig: Rig, found: Found, frame: int, phase: float) -> np.ndarray:
 
     def seen(points: np.ndarray) -> np.ndarray:
         cam = (points - _AIM) @ R.T + [0, 0, _DISTANCE_M]
-        focal = scale * _FOCAL_PX * 0.5
+        focal = scale * _FOCAL_PX
         depth = np.maximum(cam[:, 2], 0.05)
         return np.column_stack(
             [focal * cam[:, 0] / depth + width / 2, focal * cam[:, 1] / depth + height / 2, depth]
@@ -101,9 +101,9 @@ def in_space(rig: Rig, found: Found, frame: int, phase: float) -> np.ndarray:
             ends = np.round(8 * seen(path)[:, :2]).astype(np.int32)
             cv2.polylines(image, [ends], False, color, 1, cv2.LINE_AA, shift=3)
 
-    place = np.linspace(-0.3, 0.3, 9)
-    lines(np.array([[[x, -0.3, 0], [x, 0.3, 0]] for x in place]), (58, 62, 70))
-    lines(np.array([[[-0.3, y, 0], [0.3, y, 0]] for y in place]), (58, 62, 70))
+    place = np.linspace(-0.2, 0.2, 9)
+    lines(np.array([[[x, -0.2, 0], [x, 0.2, 0]] for x in place]), (58, 62, 70))
+    lines(np.array([[[-0.2, y, 0], [0.2, y, 0]] for y in place]), (58, 62, 70))
     for side, vertices in zip(found.sides, found.vertices_world[frame], strict=True):
         if np.isfinite(vertices).all():
             shade = vertices * [1, 1, 0]
@@ -155,7 +155,7 @@ def main() -> None:
     count, frames = len(found.vertices_world), []
     for frame in range(count):
         phase = frame / count
-        swept = 0.5 - 0.56 * np.cos(2 * np.pi * phase)
+        swept = 0.5 - 0.9 * np.cos(2 * np.pi * phase)
         tiles = [
             tile(rig, v, video[frame], found, frame, np.clip(swept, 0, 1)) for v, video in enumerate(videos)
         ]

@@ -92,7 +92,7 @@ def measured_scale(rows: dict[int, list[Observed]]) -> TrustScale:
     spread, off, visible = (
         np.concatenate([array.ravel() for array in arrays])
         for arrays in (
-            [row.doubts.spread_share for row in seen],
+            [np.asarray(row.doubts.spread_share) for row in seen],
             [row.point_off_share for row in seen],
             [row.visible for row in seen],
         )
@@ -105,7 +105,7 @@ def measured_scale(rows: dict[int, list[Observed]]) -> TrustScale:
         return TrustScale(layers, rays, float(np.median(spread[visible])), off_share, True)
 
     def sigmas(scale: TrustScale) -> np.ndarray:
-        return np.stack([joint_sigma(row.doubts, scale) for row in seen])[..., None]
+        return np.stack([np.asarray(joint_sigma(row.doubts, scale)) for row in seen])[..., None]
 
     def cost(logs: np.ndarray) -> float:
         sigma = sigmas(scale_of(logs))
@@ -120,7 +120,7 @@ def share_table(rows: dict[int, list[Observed]], scale: TrustScale) -> None:
     """Print how many errors of a coordinate lie within one and two standard deviations."""
     print("| views | hands | median error of a coordinate, mm | median sigma, mm | within 1 | within 2 |")
     for views, many in rows.items():
-        sigma = np.stack([joint_sigma(row.doubts, scale) for row in many])[..., None]
+        sigma = np.stack([np.asarray(joint_sigma(row.doubts, scale)) for row in many])[..., None]
         error = np.abs(np.stack([row.error_m for row in many]))
         one, two = (100 * (error < k * sigma).mean() for k in (1, 2))
         print(
@@ -132,7 +132,7 @@ def share_table(rows: dict[int, list[Observed]], scale: TrustScale) -> None:
 def network_confidence_table(rows: dict[int, list[Observed]], scale: TrustScale) -> None:
     """Print what the network's confidences are worth, over all numbers of views."""
     seen = [row for many in rows.values() for row in many]
-    confidence = np.concatenate([np.ravel(joint_confidence(row.doubts, scale)) for row in seen])
+    confidence = np.concatenate([np.asarray(joint_confidence(row.doubts, scale)).ravel() for row in seen])
     off = np.concatenate([row.point_off_share.ravel() for row in seen])
     visible = np.concatenate([row.visible.ravel() for row in seen])
     print(

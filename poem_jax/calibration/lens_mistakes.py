@@ -5,7 +5,7 @@ that a detector gives. What tells is that most hands fit better with it mended, 
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -104,7 +104,7 @@ def _with_estimated_lens(rig: Rig, keypoints_px: Array, views: Array, cap_px: fl
         def cost(k1: float, rig: Rig = rig, group: Array = group) -> float:
             return float(np.nanmean(pair_distances_px(_with_k1(rig, group, k1), keypoints_px, cap_px)))
 
-        found = minimize_scalar(cost, bounds=_RANGE, method="bounded", options={"xatol": 0.01})
+        found: Any = minimize_scalar(cost, bounds=_RANGE, method="bounded", options={"xatol": 0.01})
         rig = _with_k1(rig, group, float(found.x)) if found.fun < cost(rig.dist[group[0], 0]) else rig
     return rig
 

@@ -1,14 +1,13 @@
 """What a lens does not show, in words."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from poem_jax.geometry.distortion import WIDEST_ANGLE
 from poem_jax.geometry.rig import Rig
+from poem_jax.typing import Array, Int
 
 
-def beyond_the_lens(rig: Rig, lost: Sequence[int], what: str) -> list[str]:
+def beyond_the_lens(rig: Rig, lost: Int[Array, " view"], what: str) -> list[str]:
     """Say for each camera what lies in its image where its lens has no ray; [] = nothing.
 
     Args:

@@ -13,13 +13,11 @@ the similarity is fitted to all cameras with a robust loss, so that one that was
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
+from poem_jax.calibration.held_world import camera_moves, world_as_given
 from poem_jax.calibration.meeting_points import meeting_points, near_rig
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import (
-    axis_angle_from_rotation,
-    invert_rigid,
     rigid,
     rotation_from_axis_angle,
     skew_matrix,
@@ -35,8 +33,6 @@ _BONE_SHARE = 0.03
 """Standard deviation of a bone's length from frame to frame, as a share: what a detector makes of it."""
 _HOLD = (np.radians(5.0), 0.05)
 """Radians, and a share of the rig's extent, by which cameras are off without a doubt: it holds the world."""
-_ALIGN = 1e-3
-"""Radians, or shares of the extent, beyond which a camera counts as moved when the world is held."""
 _CONVERGED = 1e-7
 
 
@@ -93,7 +89,7 @@ def adjust_extrinsics(
     )
     state = _State(near.T_cam_from_world, points, _bone_lengths(problem, points))
     state = _solved(problem._replace(sigma_px=_noise_px(problem, state)), state)
-    T = _as_given(near.T_cam_from_world, state.T).copy()
+    T = world_as_given(near.T_cam_from_world, state.T).copy()
     T[:, :3, 3] *= extent
     return rig._replace(T_cam_from_world=T @ rig.T_cam_from_world[0])
 
@@ -127,7 +123,7 @@ def _residuals(problem: _Problem, state: _State) -> tuple[Array, Array, Array]:
     length = np.linalg.norm(state.points[:, a] - state.points[:, b], axis=-1)
     both = problem.known[:, a] & problem.known[:, b]
     bones = (np.log(np.maximum(length, 1e-9)) - state.log_bones[problem.group]) / _BONE_SHARE
-    return pixels, np.where(both, bones, 0.0), _moves(problem.T_given, state.T) / _hold()
+    return pixels, np.where(both, bones, 0.0), camera_moves(problem.T_given, state.T) / _hold()
 
 
 def _cost(problem: _Problem, state: _State) -> float:
@@ -256,33 +252,5 @@ def _bone_lengths(problem: _Problem, points: Array) -> Float[Array, "group bone"
     return found
 
 
-def _moves(T_given: Array, T: Array) -> Float[Array, "view 6"]:
-    """Return how each camera is turned (radians) and moved against where it was, in its own frame."""
-    change = T @ invert_rigid(T_given)
-    return np.concatenate([axis_angle_from_rotation(change[:, :3, :3]), change[:, :3, 3]], -1)
-
-
 def _hold() -> Float[Array, "6"]:
     return np.repeat(_HOLD, 3)
-
-
-def _as_given(T_given: Array, T: Array) -> Float[Array, "view 4 4"]:
-    """Move and scale the world so that most cameras stand where they stood."""
-
-    def moved(x: Array) -> Array:
-        R, shift, scale = rotation_from_axis_angle(x[:3]), x[3:6], np.exp(x[6])
-        # x_old_world = scale R x_new_world + shift, and lengths in the cameras grow by the scale.
-        R_cam = T[:, :3, :3] @ R.T
-        t = scale * T[:, :3, 3] - R_cam @ shift
-        return rigid(R_cam, t)
-
-    def off(x: Array) -> Array:
-        return np.linalg.norm(_moves(T_given, moved(x)) / _ALIGN, axis=-1)
-
-    start = least_squares(lambda x: (_moves(T_given, moved(x)) / _ALIGN).ravel(), np.zeros(7))
-    x = start.x
-    # Each camera's distance, not its square: the one that moved has no say.
-    for _ in range(30):
-        weight = 1 / np.sqrt(np.maximum(off(x), 0.05))
-        x = least_squares(lambda x, w=weight: (w[:, None] * _moves(T_given, moved(x)) / _ALIGN).ravel(), x).x
-    return moved(x)

@@ -6,7 +6,7 @@ would cut every bend, and shrink what the camera saw. tau is where the key point
 nearest to each other's epipolar lines. Frames in which nothing moves say nothing.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -150,7 +150,7 @@ def _best(moments: _Moments, F: dict, offsets: Array, view: int, coarse: Array) 
     costs = np.array([cost(tau) for tau in coarse])
     # As given where another offset is no better: NaN and ties included.
     start = float(coarse[costs.argmin()]) if costs.min() < cost(offsets[view]) else float(offsets[view])
-    found = minimize_scalar(cost, bounds=(start - _STEP, start + _STEP), method="bounded")
+    found: Any = minimize_scalar(cost, bounds=(start - _STEP, start + _STEP), method="bounded")
     return float(found.x) if found.fun < cost(offsets[view]) else float(offsets[view])
 
 

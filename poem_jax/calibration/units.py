@@ -71,13 +71,14 @@ def customary_metres(
     if not believed:
         tried = " and ".join(f"{d:.3g} m if in {unit}s" for unit, d in zip(customs, apart, strict=True))
         raise ValueError(
-            f"{path}: {kind} does not say its unit, and its cameras would stand {tried} apart: give --unit "
-            "(metre, centimetre, millimetre, inch, or the metres of one unit)"
+            f"{path}: {kind} does not say its unit, and its cameras would stand {tried} apart: say it "
+            "by `poem calibration convert IN rig.json --unit UNIT` (metre, centimetre, millimetre, inch, or "
+            "the metres of one unit)"
         )
     unit = believed[0]
     _log.warning(
         "%s: %s does not say its unit; read as %ss, in which its cameras stand up to %.3g m apart. If that "
-        "is wrong, give --unit",
+        "is wrong, `poem calibration convert` with --unit corrects it",
         path,
         kind,
         unit,

@@ -6,17 +6,15 @@ brings all pairs of cameras together and undoing no other does; otherwise the pa
 Causes that need nothing to be estimated come first, a new place of a camera, which explains nearly all, last.
 """
 
-from collections.abc import Callable, Iterator
-from itertools import combinations, permutations
+from itertools import combinations
 
 import numpy as np
 
 from poem_jax.calibration.epipolar import (
     epipolar_distances_px,
-    fundamental_matrix,
     ideal_keypoints,
-    median_distance,
 )
+from poem_jax.calibration.exchanged_images import exchanged_or_flipped, worst_px
 from poem_jax.calibration.findings import Finding
 from poem_jax.calibration.lens_mistakes import judge_lens
 from poem_jax.calibration.one_camera import LoneCamera, explain_camera
@@ -30,8 +28,6 @@ SUSPICIOUS_SHARE = 0.006
 between the 0.3 % of usable rigs and the 0.7 % of a bad one, on four captures."""
 UNEXPLAINED = ("one view disagrees", "views disagree")
 """Names of the findings that say only that views disagree, not why."""
-MAX_ORDERED_VIEWS = 5
-"""Of so many cameras every order is tried; of more, every exchange of two."""
 MAX_EXCHANGED_VIEWS = 12
 """Of more views no cause is looked for, as the time grows with the fourth power of their number."""
 _MAX_NAMED = 6
@@ -44,13 +40,6 @@ _CLEAR = 2.0
 """A cause must leave half the distance that any other cause leaves."""
 _TIME_IS_ENOUGH = 1.3
 """Offsets in time are named where they leave so much more than the best place of one camera, at most."""
-
-_Flip = Callable[[Array, Array], Array]
-_FLIPS: dict[str, _Flip] = {
-    "mirrored left to right": lambda uv, wh: np.stack([wh[0] - uv[..., 0], uv[..., 1]], -1),
-    "turned by 180 degrees": lambda uv, wh: wh - uv,
-    "mirrored top to bottom": lambda uv, wh: np.stack([uv[..., 0], wh[1] - uv[..., 1]], -1),
-}
 
 
 def judge_views(
@@ -85,7 +74,7 @@ def judge_views(
     copied = _copied(rig, keypoints_px, distances, limit)
     if copied:
         return copied
-    causes = _causes(rig, keypoints_px) if rig.num_views <= MAX_EXCHANGED_VIEWS else ()
+    causes = exchanged_or_flipped(rig, keypoints_px) if rig.num_views <= MAX_EXCHANGED_VIEWS else ()
     fitting = [(cost, finding) for cost, finding in causes if cost <= limit]
     fitting.sort(key=lambda pair: pair[0])
     if fitting and (len(fitting) == 1 or fitting[1][0] > _CLEAR * fitting[0][0]):
@@ -121,74 +110,12 @@ def _late(
     if offsets is None or offsets.error_px > limit or np.abs(offsets.frames).max() < LATE_FRAMES:
         return []
     if cause is not None:
-        moved = _worst(
+        moved = worst_px(
             epipolar_distances_px(cause.rig, ideal_keypoints(cause.rig, spread_frames(keypoints_px)))
         )
         if offsets.error_px > _TIME_IS_ENOUGH * moved:
             return []
     return [late_cameras(rig, offsets, time_s)]
-
-
-def _causes(rig: Rig, keypoints_px: Array) -> Iterator[tuple[float, Finding]]:
-    """Yield what may be wrong, with the largest median distance of a pair of cameras once it is undone."""
-    table = _distances_by_camera(rig, keypoints_px)
-    for order in _orders(rig.num_views):
-        cost = _worst([table[i, j][order[i], order[j]] for i, j in combinations(range(rig.num_views), 2)])
-        yield cost, _exchanged(rig, order)
-    for view, name in enumerate(rig.names):
-        for flip, turn in _FLIPS.items():
-            undone = keypoints_px.copy()
-            undone[:, :, view] = turn(undone[:, :, view], rig.size_wh[view])
-            evidence = f"the image of camera '{name}' seems to be {flip}: only so it fits the others"
-            finding = Finding("flipped image", evidence, "store it as the camera was calibrated")
-            yield _worst(epipolar_distances_px(rig, ideal_keypoints(rig, undone))), finding
-
-
-def _distances_by_camera(rig: Rig, keypoints_px: Array) -> dict[tuple[int, int], Float[Array, "view view"]]:
-    """Return, for cameras i and j, the distances were they to have taken the images of views a and b."""
-    views = range(rig.num_views)
-    ideal = []
-    for camera in views:
-        lens = rig._replace(K=rig.K[[camera] * rig.num_views], dist=rig.dist[[camera] * rig.num_views])
-        points = np.moveaxis(ideal_keypoints(lens, keypoints_px), 2, 0)
-        ideal.append(points.reshape(rig.num_views, -1, 2))
-    table = {}
-    for i, j in combinations(views, 2):
-        F = fundamental_matrix(rig, i, j)
-        table[i, j] = np.array(
-            [
-                [np.nan if a == b else median_distance(F, ideal[i][a], ideal[j][b]) for b in views]
-                for a in views
-            ]
-        )
-    return table
-
-
-def _orders(num_views: int) -> Iterator[tuple[int, ...]]:
-    """Yield which view's key points a camera may have got, other than its own."""
-    given = tuple(range(num_views))
-    if num_views <= MAX_ORDERED_VIEWS:
-        yield from (order for order in permutations(given) if order != given)
-        return
-    yield given[::-1]
-    for a, b in combinations(given, 2):
-        order = list(given)
-        order[a], order[b] = b, a
-        yield tuple(order)
-
-
-def _exchanged(rig: Rig, order: tuple[int, ...]) -> Finding:
-    moved = [
-        f"'{rig.names[view]}' is of '{rig.names[camera]}'"
-        for camera, view in enumerate(order)
-        if camera != view
-    ]
-    return Finding(
-        "cameras exchanged",
-        f"the cameras seem to be exchanged: what is given as {', '.join(moved)}; only so the views fit",
-        "rename the images or the cameras of the rig, or give the views in the rig's order of cameras "
-        "(`cameras (V,)` in the file of key points or boxes names them)",
-    )
 
 
 def _copied(
@@ -258,12 +185,6 @@ def _named_pairs(rig: Rig, distances: Array, limit: float) -> str:
     )
     named += f" and {len(pairs) - _MAX_NAMED} pairs more" if len(pairs) > _MAX_NAMED else ""
     return f"{named} off each other's epipolar lines (median; expected below {limit:.0f} px)"
-
-
-def _worst(distances: Array | list[float]) -> float:
-    """Return the largest distance; infinity where no pair of cameras can be judged."""
-    finite = np.asarray(distances)[np.isfinite(distances)]
-    return float(finite.max()) if finite.size else np.inf
 
 
 def _extent(keypoints_px: Array) -> float:

@@ -102,7 +102,7 @@ def read_rig_and_hands(
     times = [frame.time_s for frame in frames if frame.time_s is not None]
     footage = _Footage(
         tuple(frame.name for frame in frames),
-        [FramePaths(frame.name, frame.images or (None,) * take.rig.num_views) for frame in frames],
+        [FramePaths(frame.name, frame.image_files or (None,) * take.rig.num_views) for frame in frames],
     )
     known = len(times) == len(frames) > 1
     return take.rig, np.stack(points).astype(np.float64), footage, np.array(times) if known else None

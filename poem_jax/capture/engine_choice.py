@@ -231,7 +231,8 @@ def _median(parts: Sequence[Array]) -> float | None:
 
 def _least(figures: Mapping[str, Mapping[str, float | None]], figure: str, meaning: str) -> tuple[str, str]:
     """Return the engine with the least figure, and a sentence that says so."""
-    values = {name: np.inf if row[figure] is None else row[figure] for name, row in figures.items()}
+    given = {name: row[figure] for name, row in figures.items()}
+    values = {name: np.inf if value is None else value for name, value in given.items()}
     best = min(values, key=lambda name: values[name])
     if np.isinf(values[best]):
         return best, "neither engine found half of the hands that were tried, or says how sure it is"

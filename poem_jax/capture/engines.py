@@ -50,8 +50,8 @@ class EngineOptions(NamedTuple):
     checkpoint: str | os.PathLike | None = None
     network: Network | None = None
     hand: HandModel | None = None
-    smooth: bool = False
-    """Of the fit: a second pass that holds each hand's frames together."""
+    second_pass: bool = False
+    """Whether the fit holds each hand's frames together."""
     detector: str | None = None
 
 
@@ -133,7 +133,7 @@ def fit_engine(take: Take, options: EngineOptions) -> Engine:
     about = {"hand": "shipped hand" if options.hand is None else "given"}
     about |= {"detector": take.detector if detector is None else detector}
     faces = {"right": hands.right.faces, "left": hands.left.faces}
-    run = functools.partial(by_fit, hands=hands, smooth=options.smooth, detector=detector)
+    run = functools.partial(by_fit, hands=hands, smooth=options.second_pass, detector=detector)
     find = functools.partial(try_fit, hands=hands, detector=detector)
     return Engine(run, find, faces, hands, about)
 

@@ -134,7 +134,7 @@ def try_fit(
     fitted, trusted = [], []
     for index, side in enumerate(take.hand_sides):
         given, model = (keypoints[:, index], confidence[:, index]), _keypoint_models(hands, side, offsets)[0]
-        fitted.append(fit_group(model, *given, take.rig, config, None))
+        fitted.append(fit_group(model, *given, times_of(group), take.rig, config, None))
         trusted.append(joint_confidence(fitted[-1], *given, take.rig))
     yield from _with_results(group, range(len(group)), fitted, trusted)
 

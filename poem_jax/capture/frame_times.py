@@ -15,7 +15,8 @@ def timed(frames: Iterable[Frame]) -> Iterator[tuple[float, Frame]]:
     """Pass a stream on, each frame with its moment in seconds.
 
     Raises:
-        ValueError: Some frames have times and others have none, or a frame comes no later than the one before.
+        ValueError: Some frames have times and others have none, or a frame comes no later than the one
+            before.
     """
     last: tuple[float, Frame] | None = None
     for frame in frames:
@@ -30,8 +31,9 @@ def timed(frames: Iterable[Frame]) -> Iterator[tuple[float, Frame]]:
             moment = 0.0 if last is None else last[0] + SECONDS_PER_FRAME
         if last is not None and not moment > last[0]:
             raise ValueError(
-                f"frames must come later and later: expected frame '{frame.name}' after {last[0]} s, the time "
-                f"of frame '{last[1].name}' before it; got {moment} s. Correct the times, or leave them out"
+                f"frames must come later and later: expected frame '{frame.name}' after {last[0]} s, the "
+                f"time of frame '{last[1].name}' before it; got {moment} s. Correct the times, or leave them "
+                "out"
             )
         last = moment, frame
         yield last

@@ -16,7 +16,7 @@ from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import Network
 from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
 from poem_jax.capture.report import Clock
-from poem_jax.capture.smoothing import Smoother, Smoothing
+from poem_jax.capture.smoothing import OFF, Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.capture.write import Style, Written, write_results
 from poem_jax.geometry.world_origin import distant_origin, move_origin
@@ -32,8 +32,8 @@ def reconstruct(
     checkpoint: str | os.PathLike | None = None,
     network: Network | None = None,
     hand: HandModel | None = None,
-    smoothing: Smoothing = Smoothing(),
     detector: str | None = None,
+    smoothing: Smoothing = OFF,
     meshes: bool | None = None,
     formats: frozenset[Format] = DEFAULT_FORMATS,
     progress: bool = True,
@@ -52,9 +52,9 @@ def reconstruct(
         checkpoint: Of poem: model folder; None = the shipped weights. Not read when a network is given.
         network: Of poem: a model in memory.
         hand: Of the fit: the user's hand in MANO's schema, of either side; None = the shipped hand.
+        detector: Of the fit: what found the key points, as for `fit_hands`; None = as their file names it.
         smoothing: What is done to the hands of a take from frame to frame; offline adds a second pass of the
             fit that holds each hand's frames together.
-        detector: Of the fit: what found the key points, as for `fit_hands`; None = as their file names it.
         meshes: Write the meshes of every frame; None = if there is only one.
         formats: What to write beyond arrays, page, report and overlays.
         progress: Show a progress bar when there are several frames.
@@ -75,8 +75,8 @@ def reconstruct(
     chosen = engine_for(take._replace(rig=rig), engine, options)
     clock.lap("choose_engine" if chosen.choice.figures else "load_model")
     take = chosen.take
-    frames = chosen.engine.run(take.frames, take, clock)
     smoother = Smoother(take, smoothing, chosen.engine.hands)
+    frames = chosen.engine.run(take.frames, take, clock)
     frames = clock.timed("smooth", smoother.smooth(frames))
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
@@ -93,7 +93,7 @@ def fit(
     out: str | os.PathLike,
     *,
     hand: HandModel | None = None,
-    smoothing: Smoothing = Smoothing(),
+    smoothing: Smoothing = OFF,
     detector: str | None = None,
     meshes: bool | None = None,
     formats: frozenset[Format] = DEFAULT_FORMATS,

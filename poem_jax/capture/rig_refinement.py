@@ -115,13 +115,15 @@ def _check_enough(rig: Rig, keypoints_px: Array, held_out: Bool[Array, " frame"]
         if count < MIN_HANDS:
             raise ValueError(
                 f"too little to refine a rig: expected at least {MIN_HANDS} hands {what} that two cameras "
-                f"see, got {count} (every third of {len(keypoints_px)} frames is held out); give a longer take"
+                f"see, got {count} (every third of {len(keypoints_px)} frames is held out); give a longer "
+                "take"
             )
     for name, count in zip(rig.names, shared[~held_out].sum((0, 1, 3)), strict=True):
         if count < MIN_POINTS:
             raise ValueError(
                 f"too little to refine camera '{name}': expected {MIN_POINTS} key points or more that "
-                f"another camera sees too, got {count}; move the hands where it sees them, or leave it out of the rig"
+                f"another camera sees too, got {count}; move the hands where it sees them, or leave "
+                "it out of the rig"
             )
 
 

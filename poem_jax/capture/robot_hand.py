@@ -5,6 +5,7 @@ joints of the person, scaled (Qin et al., AnyTeleop, 2023). The vectors taken he
 to the tips; the scale makes the person's fingers as long as the robot's.
 """
 
+import importlib.metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ class RobotHand(NamedTuple):
     name: str
     side: str
     urdf: str
-    """Below the folder of the package `example-robot-data`."""
+    """Where it ends in the package `example-robot-data`."""
     knuckle: str
     """The link that stands for the middle knuckle."""
     tips: tuple[str, str, str, str]
@@ -86,12 +87,15 @@ def packaged_urdf(robot: RobotHand) -> Path:
     Raises: ModuleNotFoundError, FileNotFoundError: The package, or the file in it, is not there.
     """
     try:
-        from example_robot_data.path import EXAMPLE_ROBOT_DATA_MODEL_DIR  # pyright: ignore
-    except ModuleNotFoundError as error:
+        files = importlib.metadata.files("example-robot-data") or []
+    except importlib.metadata.PackageNotFoundError as error:
         raise ModuleNotFoundError(
             f"the URDF of {robot.name} comes with example-robot-data: {HOW_TO_INSTALL}; or give --urdf FILE"
         ) from error
-    return Path(EXAMPLE_ROBOT_DATA_MODEL_DIR) / robot.urdf
+    found = [file for file in files if file.as_posix().endswith(robot.urdf)]
+    if not found:
+        raise FileNotFoundError(f"example-robot-data holds no {robot.urdf}; give the robot's by --urdf")
+    return Path(str(found[0].locate()))
 
 
 def _solver(robot: RobotHand, urdf: Path, scale: float) -> Any:
@@ -100,7 +104,7 @@ def _solver(robot: RobotHand, urdf: Path, scale: float) -> Any:
     try:
         from dex_retargeting.retargeting_config import RetargetingConfig  # pyright: ignore
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"robot hands need dex-retargeting: {HOW_TO_INSTALL}") from error
+        raise ModuleNotFoundError(f"robot hands need dex-retargeting ({error}): {HOW_TO_INSTALL}") from error
     config = RetargetingConfig(
         type="vector",
         urdf_path=str(urdf.resolve()),

@@ -45,6 +45,9 @@ class Smoothing:
             raise ValueError(f"a hand must be bridged for 0 seconds or more; got {self.bridge_s}")
 
 
+OFF = Smoothing()
+
+
 class _Moment(NamedTuple):
     """A frame on its way through the stage; one entry a hand, None = not seen."""
 
@@ -65,8 +68,8 @@ class Smoother:
         Args:
             take: The sides of its hands.
             smoothing: What to do.
-            models: The hand models that belong to pose, shape and place, where an engine gives them; None = it gives
-                none.
+            models: The hand models that belong to pose, shape and place, where an engine gives them; None =
+                it gives none.
         """
         self._smoothing = smoothing
         self._models = [None if models is None else models.of(side) for side in take.hand_sides]
@@ -152,9 +155,13 @@ def _met(forwards: Sequence[_Moment], seen: Sequence[Sequence[MovingHand | None]
     )
     backwards = reversed(list(_forwards(turned, BOTH_WAYS)))
     return [
-        one._replace(hands=[None if a is None else a.towards(b, 0.5) for a, b in zip(one.hands, other.hands)])
+        one._replace(hands=tuple(map(_half_way, one.hands, other.hands)))
         for one, other in zip(forwards, backwards, strict=True)
     ]
+
+
+def _half_way(one: MovingHand | None, other: MovingHand | None) -> MovingHand | None:
+    return None if one is None else one.towards(other, 0.5)
 
 
 def _held(moments: Iterable[_Moment], bridge_s: float) -> Iterator[_Moment]:
@@ -213,12 +220,12 @@ def _moving(hand: HandResult, model: HandModel | None) -> MovingHand | None:
     """Return a result as a hand that can move, in float64."""
     if hand.joints_world is None:
         return None
-    expected = None if hand.expected_world is None else np.asarray(hand.expected_world, np.float64)
+    joints, expected = np.asarray(hand.joints_world, np.float64), hand.expected_world
     if hand.pose is not None and model is not None:
-        return ModelHand.posed(model, hand.pose, hand.shape, hand.translation, expected)
+        offsets = None if expected is None else expected - joints
+        return ModelHand.posed(model, hand.pose, hand.shape, hand.translation, offsets)
     carried = [hand.vertices_world, hand.root_world[None]]
     carried += [] if expected is None else [expected]
-    joints = np.asarray(hand.joints_world, np.float64)
     return MeshHand(joints, np.concatenate(carried).astype(np.float64))
 
 
@@ -237,8 +244,8 @@ def _result(seen: HandResult, moved: MovingHand | None) -> HandResult:
     if isinstance(moved, ModelHand):
         return seen._replace(
             vertices_world=_single(moved.mesh.vertices),
-            joints_world=_single(moved.joints),
-            root_world=_single(moved.joints[ROOT_JOINT]),
+            joints_world=_single(moved.mesh.joints),
+            root_world=_single(moved.mesh.joints[ROOT_JOINT]),
             pose=_single(moved.pose),
             shape=_single(moved.shape),
             translation=_single(moved.translation),

@@ -97,18 +97,22 @@ def read_sync(folder: str | os.PathLike, cameras: Sequence[str]) -> Sync:
     given = content.get("offsets_s", {})
     if not isinstance(given, dict):
         raise ValueError(f"{path}: `offsets_s` must be seconds by camera; got {given!r}")
-    for name, value in given.items():
-        _check_number(value, f"{path}: `offsets_s` of {name}", -MAX_OFFSET_S, MAX_OFFSET_S)
-    for name, value in rates.items():
-        _check_number(value, f"{path}: `frames_per_second` of {name}", 1e-3, MAX_FRAMES_PER_SECOND)
-    as_numbers = ({name: float(value) for name, value in part.items()} for part in (given, rates))
-    return Sync(*(of_cameras(part, cameras, str(path)) for part in as_numbers))
+    offsets_s = {
+        name: _checked(value, f"{path}: `offsets_s` of {name}", -MAX_OFFSET_S, MAX_OFFSET_S)
+        for name, value in given.items()
+    }
+    frames_per_second = {
+        name: _checked(value, f"{path}: `frames_per_second` of {name}", 1e-3, MAX_FRAMES_PER_SECOND)
+        for name, value in rates.items()
+    }
+    return Sync(of_cameras(offsets_s, cameras, str(path)), of_cameras(frames_per_second, cameras, str(path)))
 
 
-def _check_number(value: Any, what: str, low: float, high: float) -> None:
+def _checked(value: Any, what: str, low: float, high: float) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not math.isfinite(value) or not low <= value <= high:
         raise ValueError(f"{what} must be a number from {low:g} to {high:g}; got {value!r}")
+    return float(value)
 
 
 def _offsets(text: str | None) -> dict[str, float]:

@@ -1,5 +1,7 @@
 """`poem calibration`: check a calibration, write it in another format, refine it from the hands."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -78,9 +80,12 @@ class Convert:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """File or folder to write."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Name of the format to write; without it our own rig.json."""
+    """Name of the format to write; without it what the ending of OUT says."""
     unit: Annotated[str | None, tyro.conf.arg(metavar="UNIT")] = None
-    """Unit of the lengths in IN where its format does not say: metre, centimetre, millimetre."""
+    """Unit of the lengths in IN, whatever it says: metre, centimetre, millimetre, inch, or the metres of
+    one unit."""
+    image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H")] = None
+    """Width and height of all images, for formats that do not hold them."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
@@ -90,13 +95,12 @@ class Convert:
         from poem_jax.calibration.write_calibration import FORMATS, write_calibration
         from poem_jax.io.writable import check_inputs_stay
 
-        named = self.format or next(iter(FORMATS))
-        if named not in FORMATS:
-            raise ValueError(f"--format must be one of {', '.join(FORMATS)}; got {named!r}")
+        if self.format is not None and self.format not in FORMATS:
+            raise ValueError(f"--format must be one of {', '.join(FORMATS)}; got {self.format!r}")
         check_inputs_stay([self.out], [self.source])
-        rig = read_calibration(self.source, unit=self.unit)
-        write_calibration(self.out, rig, named)
-        print(f"{rig.num_views} cameras ({', '.join(rig.names)}) written to {self.out} as {named}")
+        rig = read_calibration(self.source, unit=self.unit, image_size=self.image_size)
+        written = write_calibration(self.out, rig, self.format)
+        print(f"{rig.num_views} cameras ({', '.join(rig.names)}) written to {written}")
         return 0
 
 
@@ -134,7 +138,7 @@ class Refine:
         for view, name in enumerate(rig.names):
             late = f", {refined.frames_late[view]:+.2f} frames late" if self.offsets else ""
             print(
-                f"{name}: turned {_degrees(refined.turned_rad[view]):.2f} degrees, moved "
+                f"{name}: turned {math.degrees(refined.turned_rad[view]):.2f} degrees, moved "
                 f"{1000 * refined.moved_m[view]:.1f} mm{late}; off the others' epipolar lines "
                 f"{_change(refined.used_px[:, view])} px, held out {_change(refined.held_out_px[:, view])} px"
             )
@@ -150,13 +154,7 @@ class Refine:
         return 0
 
 
-def _degrees(radians: float) -> float:
-    from math import degrees
-
-    return degrees(radians)
-
-
-def _change(before_after: "tuple[float, float]") -> str:
+def _change(before_after: Iterable[float]) -> str:
     before, after = before_after
     return f"{before:.2f} -> {after:.2f}"
 

@@ -24,8 +24,10 @@ class Demo:
 
         from poem_jax.capture.demo import demo_folder, demo_score
         from poem_jax.cli.reconstruct import Reconstruct
+        from poem_jax.io.writable import check_folder_is_writable
 
         start = time.perf_counter()
+        check_folder_is_writable(self.out)
         command = Reconstruct(demo_folder(), self.out)
         say(f"poem reconstruct {command.folder} --out {self.out}")
         command.run()

@@ -24,7 +24,7 @@ class Detect:
     out: File
     """The key-point file (npz) to write, for `fit` or for `reconstruct --boxes`."""
     rig: OptionalFile = None
-    """Calibration; without it rig.json or calibration/rig.json in DIR."""
+    """Calibration of any format that is read; without it the one in DIR or DIR/calibration."""
     max_hands: int = 2
     """Hands in the take, of one person or of several."""
     video: Flag = False

@@ -40,7 +40,8 @@ class Fit:
     out: Folder
     """Folder for the results; files of the same name are replaced."""
     rig: OptionalFile = None
-    """Calibration; without it rig.json or calibration/rig.json in the folder of --images or of KEYPOINTS."""
+    """Calibration of any format that is read; without it the one in the folder of --images or of KEYPOINTS,
+    or in its calibration/."""
     max_hands: int = 2
     """Hands that are looked for in a capture's images."""
     video: Flag = False
@@ -51,7 +52,7 @@ class Fit:
     mano: OptionalFile = None
     """MANO_RIGHT.pkl or MANO_LEFT.pkl, or an npz with MANO's names; without it the shipped hand."""
     smooth: Flag = False
-    """Hold the frames of a take together: less tremble, and hands that are not seen for a moment are bridged."""
+    """Hold the frames of a take together: hands tremble less, and are bridged where unseen for a moment."""
     causal: Flag = False
     """Smooth by what came before alone, as a live picture has to."""
     bridge: Bridge = None

@@ -41,7 +41,7 @@ class Reconstruct:
     out: Folder
     """Folder for the results; files of the same name are replaced."""
     rig: OptionalFile = None
-    """Calibration; without it rig.json or calibration/rig.json in DIR."""
+    """Calibration of any format that is read; without it the one in DIR or DIR/calibration."""
     boxes: OptionalFile = None
     """Boxes or key points (npz); without it boxes.npz or keypoints.npz in DIR, or what the detector finds."""
     max_hands: int = 2

@@ -1,38 +1,40 @@
 """A filter that looks back only, for hands seen one moment after the other: the live picture's.
 
-The hand x follows what is seen, y, by a share of the way that depends on the time since the last moment and
-on how far it is:
+The hand x follows what is seen, y, by a share of the way that depends on the time dt since the last moment
+and on how far it is, in the mean over the last moments, over which noise cancels and a motion does not:
 
-    x <- x + (1 - exp(-dt / T)) (y - x),   1 / T = (1 + e max(0, d^2 / (a s^2) - 1)) / T_0,
+    m <- (1 - b) m + b (y - x),   v <- (1 - b)^2 v + b^2,   b = 1 - exp(-dt / T_m),
+    x <- x + (1 - exp(-dt / T)) (y - x),   1 / T = (1 + e max(0, d^2 / (a v s^2) - 1)) / T_0,
 
-d^2 the mean square of a joint's coordinate of y - x, s the noise of what is seen from one moment to the next,
-measured on the way. What noise explains is averaged over T_0; what it does not is motion, and followed at once
-(the idea of the One-Euro filter of Casiez et al. 2012, which asks the speed instead of the distance, and so
-does not know its own noise). The hand never leaves the way between what it was and what is seen: no overshoot.
+d^2 the mean square of a joint's coordinate of m, s the noise of what is seen from one moment to the next,
+measured on the way, and v s^2 thus that of m. What noise explains is averaged over T_0; what it does not is
+motion, and followed at once (the idea of the One-Euro filter of Casiez et al. 2012, which asks the speed, and
+does not know its own noise). The hand never leaves the way between what it was and what is seen: it does not
+overshoot.
 """
 
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic
 
 import numpy as np
 
-from poem_jax.fitting.moving_hands import MovingHand
+from poem_jax.fitting.moving_hands import Hand
 from poem_jax.typing import Array, Float
-
-Hand = TypeVar("Hand", bound=MovingHand)
 
 
 @dataclass(frozen=True)
 class FilterConfig:
     """How a hand follows what is seen of it."""
 
-    rest_s: float = 0.12
+    rest_s: float = 0.25
     """T_0: how long what noise explains is averaged, seconds."""
-    eagerness: float = 1.0
+    trend_s: float = 0.08
+    """T_m: over how long a motion must show, seconds."""
+    eagerness: float = 3.0
     """e: how much quicker what noise does not explain is followed."""
-    allowance: float = 1.5
+    allowance: float = 3.0
     """a: how many times the variance of the noise counts as noise; no less than 1."""
     noise_m: float = 0.005
     """s is never taken to be more, metres, where an engine does not say itself."""
@@ -47,6 +49,7 @@ class CausalFilter(Generic[Hand]):
         self._config = config
         self._noise = FrameNoise()
         self._state: tuple[float, Hand] | None = None
+        self._trend: tuple[Array, float] = np.zeros(3), 0.0
         self.noise_m = config.noise_m
         """The noise s that was last taken, metres."""
 
@@ -69,21 +72,25 @@ class CausalFilter(Generic[Hand]):
             raise ValueError(f"moments must come later and later; got {time_s} s after {state[0]} s")
         if state is None or time_s - state[0] > config.gap_s + 1e-6:
             self._noise = FrameNoise()
-            self.noise_m = min(most, self._noise.update(time_s, seen.joints))
+            self._trend = np.zeros(3), 0.0
+            self.noise_m = min(most, self._noise.update(time_s, seen.markers))
             self._state = time_s, seen
             return seen
         last_s, hand = state
-        self.noise_m = min(most, self._noise.update(time_s, seen.joints))
-        square = float(np.mean((seen.joints - hand.joints) ** 2))
-        share = self._share(time_s - last_s, square)
+        self.noise_m = min(most, self._noise.update(time_s, seen.markers))
+        share = self._share(time_s - last_s, seen.markers - hand.markers)
         self._state = time_s, hand.towards(seen, share)
         return self._state[1]
 
-    def _share(self, step_s: float, square: float) -> float:
-        """Return how far to go towards what is seen."""
+    def _share(self, step_s: float, away: Float[Array, "joint 3"]) -> float:
+        """Return how far to go towards what is seen, and how far away it is."""
         config = self._config
-        explained = config.allowance * self.noise_m**2
-        excess = max(0.0, square / explained - 1) if explained > 0 else math.inf
+        new = 1 - math.exp(-step_s / config.trend_s)
+        mean, variance = self._trend
+        mean, variance = (1 - new) * mean + new * away, (1 - new) ** 2 * variance + new**2
+        self._trend = mean, variance
+        explained = config.allowance * variance * self.noise_m**2
+        excess = max(0.0, float(np.mean(mean**2)) / explained - 1) if explained > 0 else math.inf
         return 1 - math.exp(-step_s * (1 + config.eagerness * excess) / config.rest_s)
 
 
@@ -112,7 +119,7 @@ class FrameNoise:
 
 def bend(
     first: tuple[float, Array], middle: tuple[float, Array], last: tuple[float, Array]
-) -> tuple[Float[Array, "joint 3"], float]:
+) -> tuple[Float[Array, "*batch 3"], float]:
     """Return how far the joints in the middle of three moments (seconds, joints) lie off the straight way.
 
     And the variance of this if that of every coordinate is 1, and no more moves than noise.

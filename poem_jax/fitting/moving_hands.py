@@ -5,9 +5,9 @@ from a to b is half of the way from b to a; moving both by a rigid motion of the
 between them likewise.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, Self
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from poem_jax.geometry.transforms import (
     rotation_from_axis_angle,
     transpose,
 )
-from poem_jax.hand.model import HandMesh, HandModel, ShapedHand
+from poem_jax.hand.model import HandMesh, HandModel, ShapedHand, forward_kinematics, layer_tips
 from poem_jax.hand.topology import (
     FINGER_NAMES,
     MANO_FINGER_NAMES,
@@ -31,17 +31,21 @@ from poem_jax.hand.topology import (
 from poem_jax.typing import Array, Float
 
 
+@runtime_checkable
 class MovingHand(Protocol):
     """A hand at one moment, in the world, metres."""
 
     @property
-    def joints(self) -> Float[np.ndarray, "joint 3"]:
+    def markers(self) -> Float[np.ndarray, "joint 3"]:
         """Points by which its motion is measured."""
         ...
 
-    def towards(self, other: Self, share: float) -> Self:
-        """Return the hand that lies `share` of the way (0 to 1) from this one to another."""
+    def towards(self, other: Any, share: float) -> Any:
+        """Return the hand that lies `share` of the way (0 to 1) from this one to another of its kind."""
         ...
+
+
+Hand = TypeVar("Hand", bound=MovingHand)
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,12 @@ class MeshHand:
     points: Float[np.ndarray, "point 3"]
     """Carried along with the joints; there may be none."""
 
-    def towards(self, other: Self, share: float) -> Self:
+    @property
+    def markers(self) -> Float[np.ndarray, "joint 3"]:
+        """See `MovingHand`: the joints."""
+        return self.joints
+
+    def towards(self, other: "MeshHand", share: float) -> "MeshHand":
         """See `MovingHand`. Of a rigid motion M from a to b: M^s ((1 - s) a + s M^-1 b)."""
         R = procrustes(self.joints, other.joints, with_scale=False).R
         begin, end = self.joints.mean(0), other.joints.mean(0)
@@ -63,17 +72,15 @@ class MeshHand:
             returned = rotate_points(R.T, b - end)
             return rotate_points(turn, a - begin + share * (returned - (a - begin))) + place
 
-        return type(self)(moved(self.joints, other.joints), moved(self.points, other.points))
+        return MeshHand(moved(self.joints, other.joints), moved(self.points, other.points))
 
 
-def _carriers() -> np.ndarray:
-    """Return the skeleton joint (MANO order) whose bone carries each key point (OpenPose order)."""
-    tips = [SKELETON_FINGERS[MANO_FINGER_NAMES.index(name)][-1] for name in FINGER_NAMES]
-    parents = [max(parent, WRIST) for parent in MANO_PARENTS]
-    return np.array([*parents, *tips])[list(OPENPOSE_FROM_MANO)]
-
-
-_CARRIERS = _carriers()
+_LAST_BONES = np.array([SKELETON_FINGERS[MANO_FINGER_NAMES.index(name)][-1] for name in FINGER_NAMES])
+"""The skeleton joints (MANO order) that carry the tips, thumb to little."""
+_CARRIERS = np.array([*(max(parent, WRIST) for parent in MANO_PARENTS), *_LAST_BONES])[
+    list(OPENPOSE_FROM_MANO)
+]
+"""The skeleton joint whose bone carries each key point (OpenPose order)."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +102,8 @@ class ModelHand:
         pose: Float[Array, "16 3"],
         shape: Float[Array, "10"],
         translation: Float[Array, "3"],
-        expected: Float[Array, "21 3"] | None = None,
-    ) -> Self:
+        expected_from_joints: Float[Array, "21 3"] | None = None,
+    ) -> "ModelHand":
         """Make the hand of `hand_mesh(model, pose, shape, translation)`.
 
         Args:
@@ -104,23 +111,24 @@ class ModelHand:
             pose: Axis-angle, radians.
             shape: Coefficients.
             translation: Metres.
-            expected: Where the detector should see the joints; None = at them.
+            expected_from_joints: From each joint to where the detector should see it, metres, world; None =
+                at the joints.
         """
         pose, shape, translation = (np.asarray(x, np.float64) for x in (pose, shape, translation))
         wrist = model.shape(shape).skeleton[WRIST] + translation
         hand = cls(model, rotation_from_axis_angle(pose), shape, wrist)
-        if expected is None:
+        if expected_from_joints is None:
             return hand
-        offsets = rotate_points(transpose(hand._bones), (expected - hand.joints)[:, None])[:, 0]
-        return cls(model, hand.rotations, shape, wrist, offsets)
+        offsets = rotate_points(transpose(hand._bones), expected_from_joints[:, None])[:, 0]
+        return replace(hand, offsets=offsets)
 
-    def towards(self, other: Self, share: float) -> Self:
+    def towards(self, other: "ModelHand", share: float) -> "ModelHand":
         """See `MovingHand`."""
         turns = axis_angle_from_rotation(matmul(transpose(self.rotations), other.rotations))
         offsets = self.offsets
         if offsets is not None and other.offsets is not None:
             offsets = offsets + share * (other.offsets - offsets)
-        return type(self)(
+        return ModelHand(
             self.model,
             matmul(self.rotations, rotation_from_axis_angle(share * turns)),
             self.shape + share * (other.shape - self.shape),
@@ -128,10 +136,13 @@ class ModelHand:
             offsets,
         )
 
-    @property
-    def joints(self) -> Float[np.ndarray, "21 3"]:
-        """See `MovingHand`."""
-        return self.mesh.joints
+    @cached_property
+    def markers(self) -> Float[np.ndarray, "21 3"]:
+        """See `MovingHand`: the skeleton, and the tips as if they were rigid with the last bones."""
+        turns, skeleton = self._kinematics
+        rest = self._shaped.vertices[layer_tips(self.model)] - self._shaped.skeleton[_LAST_BONES]
+        tips = skeleton[_LAST_BONES] + rotate_points(turns[_LAST_BONES], rest[:, None])[:, 0]
+        return np.concatenate([skeleton, tips]) + self.translation
 
     @cached_property
     def mesh(self) -> HandMesh:
@@ -154,7 +165,7 @@ class ModelHand:
         """Where the detector should see the joints; None = at them."""
         if self.offsets is None:
             return None
-        return self.joints + rotate_points(self._bones, self.offsets[:, None])[:, 0]
+        return self.mesh.joints + rotate_points(self._bones, self.offsets[:, None])[:, 0]
 
     @cached_property
     def _shaped(self) -> ShapedHand:
@@ -163,4 +174,9 @@ class ModelHand:
     @property
     def _bones(self) -> Float[np.ndarray, "21 3 3"]:
         """R_world_from_bone of the bone that carries each key point."""
-        return self._shaped.pose_rotations(self.rotations).rotations[_CARRIERS]
+        return self._kinematics[0][_CARRIERS]
+
+    @cached_property
+    def _kinematics(self) -> tuple[Float[np.ndarray, "16 3 3"], Float[np.ndarray, "16 3"]]:
+        """R_world_from_joint, and the joints about the resting wrist."""
+        return forward_kinematics(self.rotations, self._shaped.skeleton)

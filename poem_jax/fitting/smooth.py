@@ -124,8 +124,8 @@ class Motion(NamedTuple):
     sigma: Float[Array, "51"]
     """The walk at rest: radians, metres."""
     precision: Float[Array, "step 51"]
-    """Of every step, in units of this walk: at rest `SmoothConfig.seconds` by the time between the frames, less
-    where the hand moves fast."""
+    """Of every step, in units of this walk: at rest `SmoothConfig.seconds` by the time between the frames,
+    less where the hand moves fast."""
 
 
 def smooth(
@@ -176,8 +176,8 @@ def motion_of(
 
     With C the covariance of a frame and P the prior's part of C^-1, the first pass shows the share
     r = 1 - diag(C P) of a motion, and its noise is diag(C - C P C). Turns and place of a step are each one
-    sample of the walk's variance, sum(step^2 - noise) / sum(r^2), never taken below that of `walk` over the time
-    between the frames.
+    sample of the walk's variance, sum(step^2 - noise) / sum(r^2), never taken below that of `walk` over the
+    time between the frames.
     """
     place = jnp.arange(STATE_SIZE) >= POSE_SIZE
     equations = _equations(model, take, state, config)

@@ -19,11 +19,14 @@ _NO_DIRECTION = 1e-12
 
 
 class Corrections(NamedTuple):
-    """correction of frame f = sum_k weights[f, k] targets[k]; the weights are within -1 and 1."""
+    """correction of frame f = base + sum_k weights[f, k] targets[k]."""
 
+    base: Float[np.ndarray, "778 3"]
+    """Offsets of the rest vertices in all frames, metres."""
     targets: Float[np.ndarray, "target 778 3"]
     """Offsets of the rest vertices, metres."""
     weights: Float[np.ndarray, "frame target"]
+    """Within 0 and 1, to which some programs hold them."""
 
 
 def few_corrections(hand: HandModel, rotations: Float[Array, "frame 16 3 3"]) -> Corrections:
@@ -41,11 +44,15 @@ def few_corrections(hand: HandModel, rotations: Float[Array, "frame 16 3 3"]) ->
     squares, turn = np.linalg.eigh(directions.T @ directions)
     strength = np.sqrt(np.maximum(squares, _NO_DIRECTION * squares[-1]))
     along = features.reshape(len(features), -1) @ (turn * strength)
-    _, principal = np.linalg.eigh(along.T @ along)
+    mean = along.mean(0)
+    _, principal = np.linalg.eigh((along - mean).T @ (along - mean))
     principal = principal[:, ::-1]
-    mixed = along @ principal
+    mixed = (along - mean) @ principal
     left_out = np.sqrt(np.cumsum(mixed[:, ::-1] ** 2, axis=1)[:, ::-1]).max(0)
     count = int((left_out > _TOLERANCE_M).sum())
-    largest = np.abs(mixed[:, :count]).max(0)
-    targets = (directions @ (turn / strength) @ (principal[:, :count] * largest)).T
-    return Corrections(targets.reshape(count, NUM_VERTICES, 3), mixed[:, :count] / largest)
+    principal, mixed = principal[:, :count], mixed[:, :count]
+    lowest, extent = mixed.min(0), np.ptp(mixed, axis=0)
+    basis = directions @ (turn / strength)
+    base = (basis @ (mean + principal @ lowest)).reshape(NUM_VERTICES, 3)
+    targets = (basis @ (principal * extent)).T.reshape(count, NUM_VERTICES, 3)
+    return Corrections(base, targets, (mixed - lowest) / extent)

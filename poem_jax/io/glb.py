@@ -107,8 +107,8 @@ class Glb:
             values: One row a time; quaternions as x, y, z, w; weights in one long row.
             steps: Keep each value until the next one's time, instead of going evenly from one to the next.
         """
-        sampler = {"input": times, "output": self.store(np.asarray(values, np.float32))}
-        sampler["interpolation"] = "STEP" if steps else "LINEAR"
+        output, how = self.store(np.asarray(values, np.float32)), "STEP" if steps else "LINEAR"
+        sampler = {"input": times, "output": output, "interpolation": how}
         self._channels.append({"sampler": len(self._samplers), "target": {"node": node, "path": path}})
         self._samplers.append(sampler)
 

@@ -23,7 +23,7 @@ from poem_jax.viz.page_content import Caption, PageCamera, PageFrame
 from poem_jax.viz.page_content import PageHand as PageHand
 from poem_jax.viz.page_data import page_data
 
-_JPEG_QUALITY = 80
+_JPEG_QUALITY = 75
 _SCRIPTS = (
     "data",
     "measures",

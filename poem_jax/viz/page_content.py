@@ -25,7 +25,7 @@ class PageHand(NamedTuple):
     vertices_world: Float[Array, "vert 3"]
     """Metres."""
     joints_world: Float[Array, "21 3"] | None = None
-    """Metres, OpenPose order."""
+    """Metres, OpenPose order: where whoever gave the key points should see the joints."""
     keypoints_px: Float[Array, "view 21 2"] | None = None
     """Where the joints were seen, in pixels of the pictures shown."""
     error_px: Float[Array, "view 21"] | None = None

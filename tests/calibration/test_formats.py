@@ -154,7 +154,7 @@ def test_a_unit_that_nobody_can_know_is_asked_for(tmp_path):
     far = rig._replace(T_cam_from_world=rig.T_cam_from_world.copy())
     far.T_cam_from_world[:, :3, 3] *= 1000
     write_calibration(path, far, "colmap")
-    with pytest.raises(ValueError, match=r"its cameras would stand .* m if in metres apart: give --unit"):
+    with pytest.raises(ValueError, match=r"would stand .* m if in metres apart: say it .* --unit"):
         read_calibration(images)
     got = read_calibration(images, unit="mm")
     np.testing.assert_allclose(got.T_cam_from_world, rig.T_cam_from_world, atol=1e-12)

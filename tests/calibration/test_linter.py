@@ -5,6 +5,7 @@ Three good rigs: two real ones of four cameras (skipped without the reference ma
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from poem_jax.capture.calibration_check import check_calibration
 from poem_jax.geometry.cameras import project
@@ -26,7 +27,9 @@ def moving_take(tau_frames=(0.0, 0.0, 0.0, 0.0), seed=3, frames=FRAMES, noise_px
     K = drawn.K.astype(float) * np.array([1.0, 0.93, 1.0])[:, None] + [[0, 0, 9.0], [0, 0, -14], [0, 0, 0]]
     dist = np.tile([-0.25, 0.06, 1e-3, -1e-3, 0.0], (4, 1))
     names = ("left", "front", "right", "above")
-    rig = Rig(names, np.tile(IMAGE_WH, (4, 1)), K, dist, drawn.T_cam_from_world.astype(float))
+    T = drawn.T_cam_from_world.astype(float)
+    T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
+    rig = Rig(names, np.tile(IMAGE_WH, (4, 1)), K, dist, T)
     hand = drawn.joints[0] - drawn.joints[0].mean(0)
     uv = np.empty((frames, 1, 4, 21, 2))
     for view, tau in enumerate(tau_frames):

@@ -26,5 +26,5 @@ def lost_network(fed=None):
             cams.view_mask.any(-1),
         )
 
-    params = {"constants": {"hand": {"faces": hand.faces}}}
+    params = {"constants": {"hand": hand._asdict()}}
     return Network(Config(image_hw=(64, 64)), Prepared(params, None, Config()), "stub", answer)

@@ -16,7 +16,7 @@ from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from tests.videos import cut, damage, number_of, write_video
 
-FRAMES = 24
+FRAMES = 14
 SIZE_WH = (240, 180)
 
 
@@ -154,12 +154,14 @@ def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeyp
 
 
 def test_a_damaged_frame_costs_its_view(search, folder, tmp_path, rig, caplog):
-    (folder / "front.avi").unlink()
-    damage(write_video(folder / "front.mp4", FRAMES, size_wh=SIZE_WH, seed=1), size=6000)
+    for seed, camera in enumerate(rig.names):
+        (folder / f"{camera}.avi").unlink()
+        write_video(folder / f"{camera}.mp4", 24, size_wh=SIZE_WH, seed=seed)
+    damage(folder / "front.mp4", size=6000)
     with caplog.at_level(logging.WARNING):
         assert search()[0] == 0
     found = numbers(tmp_path / "found.npz")
-    np.testing.assert_array_equal(found[:, [0, 2]], np.tile(np.arange(FRAMES)[:, None], 2))
+    np.testing.assert_array_equal(found[:, [0, 2]], np.tile(np.arange(24)[:, None], 2))
     lost = np.isnan(found[:, 1])
     assert 1 <= lost.sum() <= 10
     assert (found[~lost, 1] == np.flatnonzero(~lost)).mean() > 0.9
@@ -172,7 +174,7 @@ def test_a_video_that_is_cut_short_ends_the_take(search, folder, tmp_path, rig, 
     cut(folder / f"{rig.names[1]}.avi")
     assert search()[0] == 0
     assert "front.avi is cut short" in caplog.text
-    assert 10 < len(numbers(tmp_path / "found.npz")) < 18
+    assert 5 < len(numbers(tmp_path / "found.npz")) < 12
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_no_hand_at_all_leaves_nothing_to_compare(rig):
     ("name", "options", "message"),
     [
         ("fit", EngineOptions(checkpoint="ckpt"), "a fit has no weights"),
-        ("poem", EngineOptions(smooth=True), "poem has its own hand"),
+        ("poem", EngineOptions(detector="none"), "poem has its own hand"),
         ("poem", EngineOptions(hand=default_hand()), "poem has its own hand"),
         ("neural", EngineOptions(), "must be one of auto, fit, poem; got 'neural'"),
     ],

@@ -16,10 +16,11 @@ from poem_jax.capture.fit import _windows, fit_hands, hands_of
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.pipeline import fit, reconstruct
+from poem_jax.capture.smoothing import Smoothing
 from poem_jax.capture.take import Take, make_take, read_keypoint_take, read_take
 from poem_jax.cli import main
 from poem_jax.data.capture_folder import FramePaths
-from poem_jax.geometry.distortion import distort_pixels
+from poem_jax.geometry.distortion import distort_pixels, fisheye_lens, stack_lenses
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
 from poem_jax.geometry.world_origin import move_origin
@@ -278,8 +279,10 @@ def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
     assert "--formats must be a list of glb, bvh" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", "--checkpoint", "ckpt"]) == 2
     assert "a fit has no weights" in capsys.readouterr().err
-    assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--smooth"]) == 2
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--mano", "hand.npz"]) == 2
     assert "for --engine fit" in capsys.readouterr().err
+    assert main([*arguments, str(tmp_path / "out"), "--bridge", "0.1"]) == 2
+    assert "--bridge goes with --smooth" in capsys.readouterr().err
 
 
 def test_of_both_engines_the_better_one_is_taken(files, fitted, tmp_path):
@@ -344,6 +347,24 @@ def test_points_beyond_the_fold_of_a_lens_are_dropped(take):
     assert np.isnan(ideal).sum() == 2
 
 
+@pytest.mark.slow
+def test_the_same_hands_are_found_through_fisheyes_and_other_lenses(take, fitted, truth, tmp_path):
+    """A rig of mixed lenses; what a fisheye sees too far aside is left out, and said."""
+    lenses = [fisheye_lens(np.array([0.05, -0.02, 0.004, -0.001]))] * 2
+    lenses += [np.array([0.5, 0.1, 1e-3, -2e-3, 0.01, 0.6, 0.05, 1e-3, 1e-3, 0, -1e-3, 0, 0.02, -0.01])] * 2
+    rig = take.rig._replace(dist=stack_lenses(lenses))
+    ideal = np.moveaxis(ideal_keypoints(take.rig, take.frames.hands.keypoints_px), 2, 0)
+    raw = distort_pixels(ideal.reshape(VIEWS, -1, 2), rig.K, rig.dist).reshape(ideal.shape)
+    keypoints = np.moveaxis(raw, 0, 2).copy()
+    keypoints[0, 0, 0, 3] = rig.K[0, :2, 2] + [1.6 * rig.K[0, 0, 0], 0]
+    arrays = fit(with_keypoints(rig, keypoints), tmp_path, progress=False).arrays
+    assert np.abs(error_mm(arrays, truth) - error_mm(fitted.arrays, truth))[1:].max() < 0.5
+    warnings = json.loads((tmp_path / "report.json").read_text())["warnings"]
+    assert [
+        w for w in warnings if "camera 'cam_0': 1 key points lie where its fisheye looks more than 85" in w
+    ]
+
+
 def test_hands_outside_their_image_are_not_fitted(files, take, tmp_path, caplog):
     keypoints = take.frames.hands.keypoints_px.copy()
     keypoints[1, 0, 2, :, 0] -= 5000
@@ -392,7 +413,9 @@ def test_smoothing_from_the_command_line(files, fitted, tmp_path):
     keypoints, rig, _ = files
     out = tmp_path / "out"
     assert main(["fit", str(keypoints), "--rig", str(rig), "--out", str(out), "--smooth"]) == 0
-    assert json.loads((out / "report.json").read_text())["smooth"] is True
+    said = json.loads((out / "report.json").read_text())["smoothing"]
+    assert (said["mode"], said["bridge_s"], said["bridged_hands"]) == ("offline", 0.2, 0)
+    assert 0 < said["jitter_after_mm"] <= 1.01 * said["jitter_before_mm"]
     smooth = np.load(out / "prediction.npz")
     assert smooth["valid"].all()
     moved = np.linalg.norm(smooth["joints_world"] - fitted.arrays["joints_world"], axis=-1)
@@ -432,7 +455,8 @@ def test_takes_of_any_length_share_compiled_programs(take, tmp_path, compilation
 @pytest.mark.parametrize("smooth", [False, True])
 def test_a_long_take_is_fitted_group_by_group_with_one_shape(take, tmp_path, truth, smooth):
     count = 2 * FRAMES_TOGETHER + 9
-    written = fit(longer(take, count), tmp_path, progress=False, smooth=smooth)
+    smoothing = Smoothing("offline" if smooth else "off")
+    written = fit(longer(take, count), tmp_path, progress=False, smoothing=smoothing)
     arrays = written.arrays
     assert arrays["frames"].tolist() == [f"{frame:04d}" for frame in range(count)]
     assert arrays["valid"].all()

@@ -76,16 +76,15 @@ def rms_mm(x) -> float:
     return 1000 * float(np.sqrt(np.mean(np.sum(np.square(x), -1))))
 
 
-@pytest.mark.parametrize("posed", [False, True])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("mode", "posed"), [("offline", False), ("causal", True)])
 def test_a_still_hand_stays_and_a_trembling_one_calms_down(mode, posed):
-    time_s = np.arange(90) / 30
-    rest = partial(results, Motion(0, pace=0), time_s, posed)
+    time_s = np.arange(36) / 30
+    rest = partial(results, Motion(0, pace=0.0), time_s, posed)
     truth = joints_of(rest())
-    np.testing.assert_allclose(joints_of(smoothed(frames_of(rest()), mode)), truth, atol=1e-6)
+    np.testing.assert_allclose(joints_of(smoothed(frames_of(rest()[:8]), mode)), truth[:8], atol=1e-6)
     told = {}
     after = joints_of(smoothed(frames_of(rest(0.003)), mode, told=told))
-    assert rms_mm((after - truth)[20:]) < rms_mm(joints_of(rest(0.003)) - truth) / 2.5
+    assert rms_mm((after - truth)[12:-6]) < rms_mm(joints_of(rest(0.003)) - truth) / 2
     assert told["mode"] == mode
     assert told["bridged_hands"] == 0
     assert told["jitter_after_mm"] < told["jitter_before_mm"] / 2.5
@@ -98,15 +97,14 @@ def test_off_changes_nothing():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_pose_shape_and_place_stay_those_of_the_mesh(mode):
-    hands = results(Motion(1), np.arange(30) / 30, True, 0.002)
-    for hand in smoothed(frames_of(unseen(hands, (10, 11))), mode):
+    hands = results(Motion(1), np.arange(15) / 30, True, 0.002)
+    for hand in smoothed(frames_of(unseen(hands, (6, 7))), mode):
         mesh = hand_mesh(default_hand(), hand.pose, hand.shape, hand.translation)
         np.testing.assert_allclose(mesh.vertices, hand.vertices_world, atol=1e-5)
         np.testing.assert_allclose(mesh.joints, hand.joints_world, atol=1e-5)
         np.testing.assert_array_equal(hand.root_world, hand.joints_world[ROOT_JOINT])
-        np.testing.assert_allclose(
-            np.linalg.norm(hand.expected_world - hand.joints_world, axis=-1), 0.0052, rtol=0.02
-        )
+        offset = np.linalg.norm(hand.expected_world - hand.joints_world, axis=-1)
+        np.testing.assert_allclose(offset, 0.0052, rtol=0.2)
         assert hand.vertices_world.dtype == np.float32
 
 
@@ -114,14 +112,13 @@ def test_pose_shape_and_place_stay_those_of_the_mesh(mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_short_gap_is_bridged_and_marked(mode, posed):
     """Offline along the way of the hand, in a live picture where it was; nothing is said to be seen."""
-    time_s = np.arange(40) / 30
-    hands = results(Motion(2, pace=0.5), time_s, posed)
+    hands = results(Motion(2, pace=0.5), np.arange(18) / 30, posed)
     truth = joints_of(hands)
-    gap = range(15, 21)
+    gap = range(8, 14)
     told = {}
     frames = frames_of(unseen(hands, gap))
     after = smoothed(frames, mode, told=told)
-    assert [hand.bridged for hand in after] == [index in gap for index in range(40)]
+    assert [hand.bridged for hand in after] == [index in gap for index in range(18)]
     assert told["bridged_hands"] == 6
     for index in gap:
         hand = after[index]
@@ -129,7 +126,7 @@ def test_a_short_gap_is_bridged_and_marked(mode, posed):
         assert not hand.view_mask.any()
         assert hand.joint_sigma_m is None
         assert hand.joint_confidence is None
-        last = after[14].joints_world
+        last = after[7].joints_world
         error = np.linalg.norm(hand.joints_world - truth[index], axis=-1).max()
         stay = np.linalg.norm(last - truth[index], axis=-1).max()
         assert error < 0.5 * stay if mode == "offline" else np.array_equal(hand.joints_world, last)
@@ -138,13 +135,12 @@ def test_a_short_gap_is_bridged_and_marked(mode, posed):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_longer_gap_stays_empty(mode):
     """Offline as a whole; in a live picture the hand cannot know, and goes after the stated time."""
-    time_s = np.arange(40) / 30
-    hands = unseen(results(Motion(2), time_s, False), range(15, 22))
+    hands = unseen(results(Motion(2), np.arange(16) / 30, False), range(5, 12))
     after = smoothed(frames_of(hands), mode)
-    held = range(15, 21) if mode == "causal" else ()
-    assert [hand.bridged for hand in after] == [index in held for index in range(40)]
-    assert after[21].reason == "seen by nobody"
-    assert [h.reason for h in smoothed(frames_of(hands), mode, bridge_s=0)].count("seen by nobody") == 7
+    held = range(5, 11) if mode == "causal" else ()
+    assert [hand.bridged for hand in after] == [index in held for index in range(16)]
+    assert after[11].reason == "seen by nobody"
+    assert [h.reason for h in smoothed(frames_of(hands), mode, bridge_s=0.0)].count("seen by nobody") == 7
     longer = smoothed(frames_of(hands), mode, bridge_s=0.24)
     assert all(hand.reason is None for hand in longer)
 
@@ -158,22 +154,22 @@ def test_before_the_first_and_after_the_last_sight_nothing_is_made_up(mode):
 
 
 def test_two_hands_are_bridged_each_by_itself():
-    time_s = np.arange(30) / 30
+    time_s = np.arange(16) / 30
     one, other = (results(Motion(seed), time_s, False) for seed in (3, 4))
-    one, other = unseen(one, (8, 9)), unseen(other, range(9, 25))
+    one, other = unseen(one, (3, 4)), unseen(other, range(4, 14))
     frames = [
         frame._replace(hands=pair)
         for frame, pair in zip(frames_of(one), zip(one, other, strict=True), strict=True)
     ]
     out = list(Smoother(Take(RIG, ("right", "right"), frames), Smoothing("offline"), MODELS).smooth(frames))
-    assert [f.hands[0].bridged for f in out] == [index in (8, 9) for index in range(30)]
+    assert [f.hands[0].bridged for f in out] == [index in (3, 4) for index in range(16)]
     assert not any(f.hands[1].bridged for f in out)
-    assert sum(f.hands[1].reason is not None for f in out) == 16
+    assert sum(f.hands[1].reason is not None for f in out) == 10
 
 
 def test_a_live_picture_waits_for_nothing():
     """Frame by frame; and what is yet to come changes nothing."""
-    frames = frames_of(unseen(results(Motion(5), np.arange(20) / 30, False, 0.002), (7,)))
+    frames = frames_of(unseen(results(Motion(5), np.arange(14) / 30, False, 0.002), (7,)))
     taken = []
 
     def source():
@@ -181,15 +177,17 @@ def test_a_live_picture_waits_for_nothing():
             taken.append(frame.name)
             yield frame
 
+    whole = []
     for frame in Smoother(Take(RIG, ("right",), frames), Smoothing("causal"), MODELS).smooth(source()):
         assert taken[-1] == frame.name
-    whole, part = smoothed(frames, "causal"), smoothed(frames[:12], "causal")
-    np.testing.assert_array_equal(joints_of(whole[:12]), joints_of(part))
+        whole.append(frame.hands[0])
+    part = smoothed(frames[:10], "causal")
+    np.testing.assert_array_equal(joints_of(whole[:10]), joints_of(part))
 
 
 def test_offline_holds_few_frames():
     """However long the take is; a gap adds no more than it lasts."""
-    hands = unseen(results(Motion(5), np.arange(120) / 30, False), range(50, 56))
+    hands = unseen(results(Motion(5), np.arange(40) / 30, False), range(20, 26))
     taken = 0
 
     def source():
@@ -203,17 +201,25 @@ def test_offline_holds_few_frames():
     assert max(taken - index for index, _ in given) <= 20
 
 
-def test_offline_the_first_and_the_last_are_alike():
-    """Time turned round gives the same motion turned round; nothing is late."""
-    time_s = np.arange(12) / 30
-    hands = results(Motion(6, pace=0.3), time_s, False, 0.002)
-    there, back = (joints_of(smoothed(frames_of(h))) for h in (hands, hands[::-1]))
-    np.testing.assert_allclose(there, back[::-1], atol=5e-4)
+def test_offline_nothing_is_late():
+    """A slow hand, whose every step is less than the noise: late if one looks back only."""
+    rest = results(Motion(6, pace=0.0), np.zeros(1), False)[0]
+    steps = 0.001 * np.arange(45)[:, None] * np.array([1, 0, 0], np.float32)
+    names = ("vertices_world", "joints_world", "root_world")
+    hands = [rest._replace(**{name: getattr(rest, name) + step for name in names}) for step in steps]
+    trembling = 0.003 * np.random.default_rng(0).normal(size=(45, 21, 3)).astype(np.float32)
+    seen = [h._replace(joints_world=h.joints_world + off) for h, off in zip(hands, trembling, strict=True)]
+    late = {
+        mode: float(np.mean((joints_of(hands) - joints_of(smoothed(frames_of(seen), mode)))[15:-12, :, 0]))
+        for mode in MODES
+    }
+    assert late["causal"] > 0.002
+    assert abs(late["offline"]) < 0.3 * late["causal"]
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_moving_the_world_moves_the_hands(mode):
-    hands = unseen(results(Motion(7), np.arange(25) / 30, False, 0.002), (9, 10))
+    hands = unseen(results(Motion(7), np.arange(14) / 30, False, 0.002), (9, 10))
     R, t = Rotation.random(rng=1), np.array([0.5, 1.0, -0.3])
 
     def moved(hand: HandResult) -> HandResult:

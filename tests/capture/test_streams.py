@@ -40,7 +40,7 @@ def flat_network(stop=None):
             cams.view_mask.any(-1),
         )
 
-    params = {"constants": {"hand": {"faces": hand.faces}}}
+    params = {"constants": {"hand": hand._asdict()}}
     return Network(Config(image_hw=(64, 64)), Prepared(params, None, Config()), "stub", answer)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from poem_jax.fitting.causal import CausalFilter, FilterConfig, FrameNoise
+from poem_jax.fitting.causal import CausalFilter, FrameNoise
 from poem_jax.fitting.moving_hands import MeshHand
 
 NO_POINTS = np.zeros((0, 3))
@@ -12,9 +12,9 @@ HAND = 0.05 * np.random.default_rng(0).normal(size=(21, 3))
 RATE = 30
 
 
-def follow(time_s, joints, most_noise_m=None, config=FilterConfig()) -> np.ndarray:
+def follow(time_s, joints, most_noise_m=None) -> np.ndarray:
     """Run the filter over joints (frame, 21, 3)."""
-    one = CausalFilter(config)
+    one = CausalFilter()
     hands = (MeshHand(each, NO_POINTS) for each in joints)
     return np.stack([one.update(t, hand, most_noise_m).joints for t, hand in zip(time_s, hands, strict=True)])
 
@@ -42,9 +42,9 @@ def test_a_hand_at_rest_stays():
 @pytest.mark.parametrize("sigma_m", [0.0005, 0.0015, 0.004])
 def test_a_hand_at_rest_trembles_less(sigma_m):
     """Whatever the noise; it need not be known."""
-    truth = along(np.zeros((300, 3)))
+    truth = along(np.zeros((90, 3)))
     seen = truth + tremble(truth.shape, sigma_m)
-    followed = follow(np.arange(300) / RATE, seen)
+    followed = follow(np.arange(90) / RATE, seen)
     assert rms(followed[30:] - truth[30:]) < rms(seen - truth) / 2.5
     assert rms(np.diff(followed[30:], 2, 0)) < rms(np.diff(seen, 2, 0)) / 2.5
 
@@ -75,24 +75,18 @@ def test_uneven_moments_give_what_even_ones_give():
     some = np.sort(rng.choice(np.arange(1, 179), 60, replace=False))
     curve = along(np.stack([0.1 * np.sin(2 * even), 0.05 * np.cos(3 * even), 0 * even], -1))
     every, few = follow(even, curve, 0.002), follow(even[some], curve[some], 0.002)
-    assert np.linalg.norm(every[some] - few, axis=-1)[5:].max() < 0.004
-    assert np.linalg.norm(np.diff(curve, axis=0), axis=-1).max() > 0.003, "it is not at rest"
+    assert np.linalg.norm(every[some] - few, axis=-1)[5:].mean() < 0.002
+    assert np.linalg.norm(curve - curve.mean(0), axis=-1).mean() > 0.05, "it is not at rest"
 
 
 def test_the_rate_of_a_hand_at_rest_is_in_seconds():
-    """A small step is followed in the same time whatever the number of moments."""
-    config = FilterConfig(noise_m=0.01)
-    place = np.array([0.0, 0, 0])
-    reached = []
+    """A hand that trembles is averaged as long at 120 moments a second as at 30: twice as well."""
+    left = []
     for rate in (30, 120):
-        time_s = np.arange(-rate, rate + 1) / rate
-        places = place + 0.001 * (time_s > 0)[:, None]
-        one = CausalFilter(config)
-        for moment, joints in zip(time_s, along(places), strict=True):
-            joints = joints + tremble(joints[None].shape, 0.01, int(1000 * moment))[0] * (moment < -0.5)
-            last = one.update(moment, MeshHand(joints, NO_POINTS))
-        reached.append(last.joints[0, 0] - HAND[0, 0])
-    np.testing.assert_allclose(reached[0], reached[1], rtol=0.05)
+        truth = along(np.zeros((2 * rate, 3)))
+        seen = truth + 0.002 * np.random.default_rng(0).normal(size=truth.shape)
+        left.append(rms((follow(np.arange(2 * rate) / rate, seen) - truth)[rate:]))
+    assert left[0] / left[1] == pytest.approx(2, rel=0.25)
 
 
 def test_moving_the_world_moves_what_is_filtered():

@@ -12,6 +12,7 @@ import numpy as np
 from poem_jax.evaluation.metrics import evaluate
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
+from poem_jax.hand.topology import NUM_SHAPES
 from poem_jax.typing import Array, Float
 
 TRUTH = "truth.npz"
@@ -47,7 +48,8 @@ def demo_truth() -> Truth:
     """Return the true hands; the file holds poses, the shipped hand makes meshes of them."""
     with np.load(demo_folder() / TRUTH) as stored:
         sides = tuple(map(str, stored["hand_side"]))
-        pose, shape, place = stored["pose"], stored["shape"], stored["translation"]
+        pose, place = stored["pose"], stored["translation"]
+        shape = np.broadcast_to(stored["shape"], (len(pose), NUM_SHAPES))
     meshes = [hand_mesh(default_hand(side), pose[:, h], shape, place[:, h]) for h, side in enumerate(sides)]
     vertices, joints = (
         np.stack([np.asarray(getattr(mesh, name)) for mesh in meshes], axis=1)

@@ -79,7 +79,7 @@ def _skinned(hand: HandMotion, time_s: Float[Array, " frame"]) -> tuple[Skin, Sk
     weights = np.zeros((len(time_s), len(corrections.targets)))
     weights[hand.seen] = corrections.weights
     names, parents = SKELETON_JOINT_NAMES, MANO_PARENTS
-    rest = (shaped.vertices, model.faces, model.weights, shaped.skeleton)
+    rest = (shaped.vertices + corrections.base, model.faces, model.weights, shaped.skeleton)
     skin = Skin(*rest, parents, names, corrections.targets)
     turns = quaternion_from_rotation(skeleton.rotations)
     return skin, SkinMotion(time_s, hand.seen, turns, skeleton.wrist, weights)

@@ -119,7 +119,7 @@ class _Video:
         self._file = ExitStack()
         self._writer: cv2.VideoWriter | None = None
         self._temporary = path
-        self._grey: UInt8[Array, "h w 3"] | None = None
+        self._grey: UInt8[np.ndarray, "h w 3"] = np.zeros((1, 1, 3), np.uint8)
         self._count = 0
 
     def append(self, image: UInt8[Array, "h w 3"] | None, rate: float) -> None:

@@ -15,8 +15,8 @@ PAGE_FRAMES = 120
 """A take with more frames that hold a hand is thinned out evenly for the page."""
 LONG_TAKE = 20
 """Frames beyond which overlays become videos."""
-_PAGE_PIXELS = 20e6
-"""Of all pictures of a page together: as JPEG they take 3 to 5 MB."""
+_PAGE_PIXELS = 14e6
+"""Of all pictures of a page together: as JPEG they take 2 to 3 MB, in the page 3 to 4."""
 _LEAST_PICTURE_PX, _LARGEST_PICTURE_PX = 160, 640
 """Longer side of a page's picture."""
 _PICTURE_SAMPLES = 3.0

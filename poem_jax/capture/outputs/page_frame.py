@@ -81,7 +81,7 @@ def _page_hand(
     expected = hand.joints_world if hand.expected_world is None else hand.expected_world
     return PageHand(
         hand.vertices_world,
-        hand.joints_world,
+        expected,
         None if seen_px is None else _in_pictures(seen_px, rig, cameras),
         None if seen_px is None else joint_errors_px(expected, seen_px, rig),
         hand.joint_sigma_m,

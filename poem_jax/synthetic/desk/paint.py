@@ -142,6 +142,6 @@ def _look_up(texture: Array, u: Array, v: Array) -> Array:
     """Sample a texture at many places; OpenCV wants them as an image of limited width."""
     width = 4096
     count = -(-len(u) // width) * width
-    maps = [np.resize(x.astype(np.float32), count).reshape(-1, width) for x in (u, v)]
-    out = cv2.remap(texture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    columns, rows = (np.resize(x.astype(np.float32), count).reshape(-1, width) for x in (u, v))
+    out = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return out.reshape(count, *texture.shape[2:])[: len(u)]

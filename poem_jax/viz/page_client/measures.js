@@ -5,11 +5,11 @@ const STOPS = [[58, 137, 145], [128, 184, 144], [238, 211, 122], [231, 146, 84],
 const NO_COLOUR = [140, 148, 158];
 const MEASURES = [
   {
-    name: "sigma", label: "Uncertainty", unit: "mm", factor: 1000, digits: 1, array: "sigma_m",
+    name: "sigma", label: "Uncertainty", unit: "mm", factor: 1000, digits: 1, array: "sigma_m", least: 0.005,
     title: "Uncertainty per joint, mm (one sigma)", of: (values) => values,
   },
   {
-    name: "error", label: "Reprojection", unit: "px", factor: 1, digits: 1, array: "error_px",
+    name: "error", label: "Error", unit: "px", factor: 1, digits: 1, array: "error_px", least: 10,
     title: "From key point to joint, px", of: overViews,
   },
   {
@@ -18,9 +18,10 @@ const MEASURES = [
   },
 ].filter((measure) => arrays[measure.array] !== null);
 
-for (const measure of MEASURES) measure.worst = measure.best ? 0 : worstOf(arrays[measure.array]);
+for (const measure of MEASURES) measure.worst = measure.best ? 0 : Math.max(worstOf(arrays[measure.array]), measure.least);
 
-/* A round value that nineteen of twenty values of the whole take do not exceed: frames compare by colour. */
+/* The warmest colour begins at `worst`: never at a value that is good by itself (`least`), and else at a
+   round value that nineteen of twenty values of the whole take do not exceed: frames compare by colour. */
 function worstOf(numbers) {
   const known = Float32Array.from(numbers.whole.filter((whole) => whole !== UNKNOWN)).sort();
   const high = known.length ? known[Math.floor(0.95 * (known.length - 1))] * numbers.step : 1;

@@ -27,7 +27,7 @@ class Panel {
     this.title();
     this.hands = take.hands.map((hand, index) => this.hand(hand, index, refresh));
     document.getElementById("hands").replaceChildren(...this.hands.map((hand) => hand.row));
-    const options = [[null, "Left, right"], ...MEASURES.map((measure) => [measure, measure.label])];
+    const options = [[null, "Side"], ...MEASURES.map((measure) => [measure, measure.label])];
     this.choose = choice(document.getElementById("measures"), jointWeights ? options : options.slice(1), (measure) => {
       state.measure = measure;
       refresh();
