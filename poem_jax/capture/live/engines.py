@@ -88,7 +88,7 @@ class _LiveHandFit:
         self._kept: list[tuple[Array, Array]] = []
         """Key points and confidence of the moments that are to settle the shape."""
         self._kept_s = -np.inf
-        self._shape: Float[Array, 10] | None = None
+        self._shape: Array | None = None
 
     def compile(self) -> None:
         """Make the programs of an unknown shape and of a known one."""
@@ -111,7 +111,7 @@ class _LiveHandFit:
                 self._shape, self._kept = fitted.shape[-1], []
         return fitted_hand(fitted, len(together) - 1, joint_confidence(fitted, *group, self._rig))
 
-    def _fit(self, keypoints: Array, confidence: Array, shape: Array | None):
+    def _fit(self, keypoints: Array, confidence: Array, shape: Array | None) -> "FitResult":
         size = MOMENTS_FOR_SHAPE if shape is None else 1
         # Single moments know no time.
         times = np.arange(len(keypoints), dtype=float)
