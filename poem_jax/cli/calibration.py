@@ -80,9 +80,11 @@ class Convert:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """File or folder to write."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Name of the format to write; without it our own rig.json."""
+    """Name of the format to write; without it the one that the ending of OUT says."""
     unit: Annotated[str | None, tyro.conf.arg(metavar="UNIT")] = None
     """Unit of the lengths in IN where its format does not say: metre, centimetre, millimetre."""
+    image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H")] = None
+    """Width and height of the images where the format does not say."""
     debug: Flag = False
     """Show the full traceback of an error."""
 
@@ -92,13 +94,12 @@ class Convert:
         from poem_jax.calibration.write_calibration import FORMATS, write_calibration
         from poem_jax.io.writable import check_inputs_stay
 
-        named = self.format or next(iter(FORMATS))
-        if named not in FORMATS:
-            raise ValueError(f"--format must be one of {', '.join(FORMATS)}; got {named!r}")
+        if self.format is not None and self.format not in FORMATS:
+            raise ValueError(f"--format must be one of {', '.join(FORMATS)}; got {self.format!r}")
         check_inputs_stay([self.out], [self.source])
-        rig = read_calibration(self.source, unit=self.unit)
-        write_calibration(self.out, rig, named)
-        print(f"{rig.num_views} cameras ({', '.join(rig.names)}) written to {self.out} as {named}")
+        rig = read_calibration(self.source, unit=self.unit, image_size=self.image_size)
+        written = write_calibration(self.out, rig, self.format)
+        print(f"{rig.num_views} cameras ({', '.join(rig.names)}) written to {written}")
         return 0
 
 
