@@ -14,7 +14,7 @@ import numpy as np
 
 from poem_jax.capture.fit import hands_of
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.smoothing import Smoother, Smoothing
+from poem_jax.capture.smoothing import OFF, Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.fitting import FitConfig, Observations, fit_take, keypoint_model
 from poem_jax.fitting.smooth import SmoothConfig
@@ -84,14 +84,14 @@ def network_like(take: KeypointTake, seed: int) -> list[HandResult]:
     ]
 
 
-def through_the_stage(hands: list[HandResult], take: KeypointTake, mode: str) -> Array:
+def through_the_stage(hands: list[HandResult], take: KeypointTake, smoothing: Smoothing) -> Array:
     """Return the joints (frame, 21, 3) that the stage gives on."""
     boxes = np.full((1, VIEWS, 4), np.nan)
     frames = [Frame(str(f), boxes, hands=(hand,), time_s=TIMES[f]) for f, hand in enumerate(hands)]
     names = tuple(map(str, range(VIEWS)))
     rig = Rig(names, np.tile(IMAGE_WH, (VIEWS, 1)), take.K, np.zeros((VIEWS, 5)), take.T_cam_from_world)
-    smoother = Smoother(Take(rig, ("right",), frames), Smoothing(mode), hands_of(HAND))
-    return np.stack([frame.hands[0].joints_world for frame in smoother.smooth(frames)])
+    smoother = Smoother(Take(rig, ("right",), frames), smoothing, hands_of(HAND))
+    return np.stack([np.asarray(frame.hands[0].joints_world) for frame in smoother.smooth(frames)])
 
 
 def measured(joints: Array, take: KeypointTake, motion: Motion) -> Row:
@@ -130,17 +130,17 @@ def rows(pace: float, seeds: range = SEEDS) -> dict[tuple[str, str], Row]:
         motion = Motion(seed, pace, FRAMES / RATE)
         take = see_motion(motion, HAND, TIMES, VIEWS, NOISE_PX, seed)
         alone, together, network = fitted(take, False), fitted(take, True), network_like(take, seed)
-        for name, hands, mode in (
-            ("fit", alone, "off"),
-            ("fit", alone, "causal"),
-            ("fit", together, "off"),
-            ("fit", together, "offline"),
-            ("network", network, "off"),
-            ("network", network, "causal"),
-            ("network", network, "offline"),
+        off, causal, offline = OFF, Smoothing("causal"), Smoothing("offline")
+        for name, way, hands, done in (
+            ("fit", "off", alone, off),
+            ("fit", "causal", alone, causal),
+            ("fit", "second pass alone", together, off),
+            ("fit", "offline", together, offline),
+            ("network", "off", network, off),
+            ("network", "causal", network, causal),
+            ("network", "offline", network, offline),
         ):
-            way = "second pass" if hands is together and mode == "off" else mode
-            joints = through_the_stage(hands, take, mode)
+            joints = through_the_stage(hands, take, done)
             found.setdefault((name, way), []).append(measured(joints, take, motion))
     return {key: Row(*np.mean(many, axis=0)) for key, many in found.items()}
 

@@ -224,7 +224,7 @@ def _moving(hand: HandResult, model: HandModel | None) -> MovingHand | None:
     if hand.pose is not None and model is not None:
         offsets = None if expected is None else expected - joints
         return ModelHand.posed(model, hand.pose, hand.shape, hand.translation, offsets)
-    carried = [hand.vertices_world, hand.root_world[None]]
+    carried = [np.asarray(hand.vertices_world), np.asarray(hand.root_world)[None]]
     carried += [] if expected is None else [expected]
     return MeshHand(joints, np.concatenate(carried).astype(np.float64))
 
@@ -251,6 +251,7 @@ def _result(seen: HandResult, moved: MovingHand | None) -> HandResult:
             translation=_single(moved.translation),
             expected_world=None if moved.expected is None else _single(moved.expected),
         )
+    assert isinstance(moved, MeshHand)
     vertices, root, expected = np.split(moved.points, [NUM_VERTICES, NUM_VERTICES + 1])
     return seen._replace(
         vertices_world=_single(vertices),

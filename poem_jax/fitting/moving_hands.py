@@ -136,9 +136,13 @@ class ModelHand:
             offsets,
         )
 
-    @cached_property
+    @property
     def markers(self) -> Float[np.ndarray, "21 3"]:
         """See `MovingHand`: the skeleton, and the tips as if they were rigid with the last bones."""
+        return self._markers
+
+    @cached_property
+    def _markers(self) -> Float[np.ndarray, "21 3"]:
         turns, skeleton = self._kinematics
         rest = self._shaped.vertices[layer_tips(self.model)] - self._shaped.skeleton[_LAST_BONES]
         tips = skeleton[_LAST_BONES] + rotate_points(turns[_LAST_BONES], rest[:, None])[:, 0]
