@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from poem_jax.capture.fit import hands_of
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.smoothing import OFF, Smoother, Smoothing
 from poem_jax.capture.take import Take
@@ -22,6 +21,7 @@ from poem_jax.geometry.cameras import project
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import rotate_points, rotation_from_axis_angle
 from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.synthetic.keypoint_takes import IMAGE_WH, KeypointTake

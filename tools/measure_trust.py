@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from scipy.optimize import minimize
 
-from poem_jax.capture.fit import hands_of, try_fit
+from poem_jax.capture.fit import try_fit
 from poem_jax.capture.frame import Frame, HandCrops
 from poem_jax.capture.network import Network, load_network
 from poem_jax.capture.network_trust import (
@@ -33,6 +33,7 @@ from poem_jax.evaluation.benchmark import DEFAULT_SEED
 from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.rig import Rig
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.io.compilation_cache import use_compilation_cache
 from poem_jax.synthetic.dataset import SyntheticDataset

@@ -15,13 +15,14 @@ import numpy as np
 from poem_jax.capture.agreement import judge_boxes
 from poem_jax.capture.crop import crop_hands, hand_squares
 from poem_jax.capture.engine_choice import EngineChoice, Find, choose_engine, sample_frames
-from poem_jax.capture.fit import Hands, fit_hands, hands_of, try_fit
+from poem_jax.capture.fit import fit_hands, try_fit
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.network import Network, load_network, predict_hands
 from poem_jax.capture.read import read_images
 from poem_jax.capture.report import Clock
 from poem_jax.capture.take import Take
 from poem_jax.hand.model import HandModel
+from poem_jax.hand.pair import Hands, hands_of
 from poem_jax.typing import Array, Int
 
 EngineName = Literal["auto", "fit", "poem"]

@@ -8,7 +8,7 @@ written; a frame in which a hand cannot be fitted is marked, and stops nothing.
 
 import dataclasses
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, 
 from poem_jax.capture.take import Take
 from poem_jax.fitting.detector_offsets import offsets_of
 from poem_jax.geometry.rig import Rig
-from poem_jax.hand.model import HandModel, mirror
+from poem_jax.hand.pair import Hands
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.typing import Array
 
@@ -39,31 +39,6 @@ _CONTEXT = 16
 """Frames before and after that a smoothed frame is held to; what lies farther does not move it."""
 _FRAMES_FOR_SHAPE = 16
 """A hand's shape is settled by the first group that shows it in so many frames."""
-
-
-class Hands(NamedTuple):
-    """The hand models of both sides."""
-
-    right: HandModel
-    left: HandModel
-
-    def of(self, side: str) -> HandModel:
-        """Return the model of a side."""
-        return self.left if side == "left" else self.right
-
-    def by_side(self) -> dict[str, HandModel]:
-        """Return both models by their sides."""
-        return {"right": self.right, "left": self.left}
-
-    def other(self, side: str) -> HandModel:
-        """Return the model of the opposite side."""
-        return self.right if side == "left" else self.left
-
-
-def hands_of(model: HandModel) -> Hands:
-    """Return a hand and its mirror image."""
-    reflected = HandModel(*(np.asarray(array) for array in mirror(model)))
-    return Hands(reflected, model) if model.side == "left" else Hands(model, reflected)
 
 
 def fit_hands(

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 
 from poem_jax.batch import Prediction
-from poem_jax.capture.fit import Hands, hands_of
 from poem_jax.capture.frame import Frame, HandCrops, HandResult
 from poem_jax.capture.network_trust import (
     GENERAL,
@@ -38,6 +37,7 @@ from poem_jax.geometry.distortion import distort
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.hand.model import HandModel, mirror_pose
+from poem_jax.hand.pair import Hands, hands_of
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare

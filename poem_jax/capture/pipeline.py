@@ -75,16 +75,18 @@ def reconstruct(
     chosen = engine_for(take._replace(rig=rig), engine, options)
     clock.lap("choose_engine" if chosen.choice.figures else "load_model")
     take = chosen.take
-    smoother = Smoother(take, smoothing, chosen.engine.hands)
     frames = chosen.engine.run(take.frames, take, clock)
-    frames = clock.timed("smooth", smoother.smooth(frames))
+    smoothed: Mapping[str, Any] = {"mode": smoothing.mode}
+    if smoothing.mode != "off":
+        smoother = Smoother(take, smoothing, chosen.engine.hands)
+        frames, smoothed = clock.timed("smooth", smoother.smooth(frames)), smoother.done
     frames = clock.timed("judge", judge_hands(frames, rig))
     frames = iter(tqdm(frames, total=take.num_frames, unit="frame", disable=single or not progress))
     meshes = single if meshes is None else meshes
     sides = chosen.engine.hands and chosen.engine.hands.by_side()
     style = Style(chosen.engine.faces, meshes, not single, origin_world, sides, formats)
     about = {"engine": chosen.choice.engine, **chosen.engine.about}
-    about |= {"engine_choice": chosen.choice.as_report(), "smoothing": smoother.done}
+    about |= {"engine_choice": chosen.choice.as_report(), "smoothing": smoothed}
     return write_results(frames, take, Path(out), style, clock, about)
 
 

@@ -22,7 +22,7 @@ _SMALL_PX = 64
 _ONE_COLOUR, _SAME = 4.0, 8.0
 """Levels of 255 in an image in small; compressing it again changes few by more than 3."""
 
-ReadView = UInt8[Array, "h w 3"] | FileNotFoundError | ValueError | None
+ReadView = UInt8[Array, "_ _ 3"] | FileNotFoundError | ValueError | None
 """The image of a view, or why there is none; None = no image was expected."""
 
 _log = logging.getLogger(__name__)

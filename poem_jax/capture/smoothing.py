@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from poem_jax.capture.fit import Hands
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_times import timed
 from poem_jax.capture.jitter import Jitter
@@ -21,6 +20,7 @@ from poem_jax.capture.take import Take
 from poem_jax.fitting.causal import CausalFilter, FilterConfig
 from poem_jax.fitting.moving_hands import MeshHand, ModelHand, MovingHand
 from poem_jax.hand.model import HandModel
+from poem_jax.hand.pair import Hands
 from poem_jax.hand.topology import NUM_VERTICES, ROOT_JOINT
 from poem_jax.typing import Array
 

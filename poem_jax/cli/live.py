@@ -105,9 +105,9 @@ class Live:
         return streams
 
     def _engine(self, rig: "Rig") -> "LiveEngine":
-        from poem_jax.capture.fit import hands_of
         from poem_jax.capture.live.engines import live_fit, live_network
         from poem_jax.capture.network import load_network
+        from poem_jax.hand.pair import hands_of
         from poem_jax.hand.template import default_hand
 
         if self.engine == "poem":

@@ -12,7 +12,7 @@ import pytest
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
-from poem_jax.capture.fit import _windows, fit_hands, hands_of
+from poem_jax.capture.fit import _windows, fit_hands
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
 from poem_jax.capture.pipeline import fit, reconstruct
@@ -25,6 +25,7 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
 from poem_jax.geometry.world_origin import move_origin
 from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO
 from poem_jax.synthetic.keypoint_takes import draw_keypoint_take

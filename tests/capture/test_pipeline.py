@@ -34,6 +34,7 @@ def test_outputs_of_a_take(make_capture, tmp_path, meshes, run):
             "vertices_world": (3, 2, 778, 3),
             "root_world": (3, 2, 3),
             "joint_sigma_m": (3, 2, 21),
+            "joint_confidence": (3, 2, 3, 21),
             "reprojection_px": (3, 2, 3),
             "views_used": (3, 2, 3),
             "valid": (3, 2),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from poem_jax.capture.fit import hands_of
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_times import SECONDS_PER_FRAME, timed, times_of
 from poem_jax.capture.jitter import Jitter
@@ -15,6 +14,7 @@ from poem_jax.capture.smoothing import Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.cli.fit import smoothing_of
 from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.synthetic.moving_takes import Motion

@@ -13,7 +13,7 @@ from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import boxes_from_keypoints
 from poem_jax.capture.crop import crop_hands, hand_squares
-from poem_jax.capture.fit import NOT_FITTED, Hands, fit_config, fit_group, fitted_hand
+from poem_jax.capture.fit import NOT_FITTED, fit_config, fit_group, fitted_hand
 from poem_jax.capture.fit_trust import joint_confidence
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.live.following import SIDES
@@ -22,6 +22,7 @@ from poem_jax.capture.take import Take
 from poem_jax.fitting.detector_offsets import MEDIAPIPE_HANDS, offsets_of
 from poem_jax.fitting.kinematics import KeypointModel, keypoint_model
 from poem_jax.geometry.rig import Rig
+from poem_jax.hand.pair import Hands
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.typing import Array, Float, Int
 

@@ -3,7 +3,6 @@
 import numpy as np
 
 from poem_jax.calibration.epipolar import ideal_keypoints
-from poem_jax.capture.fit import hands_of
 from poem_jax.capture.frame import HandResult
 from poem_jax.capture.live.engines import LiveEngine
 from poem_jax.capture.live.newest import NewestShots, Shot
@@ -11,6 +10,7 @@ from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
 from poem_jax.geometry.triangulation import triangulate
 from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_VERTICES
 from tests.capture.planted_scenes import rig_of

@@ -18,7 +18,7 @@ OVERLAYS = ("overlay_left_cam.mp4", "overlay_front.mp4", "overlay_cam 3.mp4")
 
 @pytest.fixture(autouse=True)
 def no_page(monkeypatch):
-    monkeypatch.setattr(write, "write_page", lambda path, *_: path)
+    monkeypatch.setattr(write, "write_page", lambda path, *_, **__: path)
 
 
 def run(planted, out, formats, hands=HANDS, pictures=False):
