@@ -37,6 +37,7 @@ SETTLED = slice(15, -15)
 HAND = default_hand()
 MODEL = keypoint_model(HAND)
 TIMES = np.arange(FRAMES) / RATE
+DELAYS = np.arange(-0.02, 0.1, 0.004)
 
 
 class Row(NamedTuple):
@@ -94,7 +95,7 @@ def through_the_stage(hands: list[HandResult], take: KeypointTake, smoothing: Sm
     return np.stack([np.asarray(frame.hands[0].joints_world) for frame in smoother.smooth(frames)])
 
 
-def measured(joints: Array, take: KeypointTake, motion: Motion) -> Row:
+def measured(joints: Array, take: KeypointTake, delayed: Array) -> Row:
     """Hold joints against the truth."""
     off = (joints - take.joints)[SETTLED]
     pixels = [
@@ -104,18 +105,21 @@ def measured(joints: Array, take: KeypointTake, motion: Motion) -> Row:
         1000 * rms(off),
         rms((pixels[0] - pixels[1])[SETTLED]),
         1000 * rms(np.diff(joints - take.joints, 2, axis=0)[SETTLED]),
-        1000 * lateness(joints, motion),
+        1000 * lateness(joints, delayed),
     )
 
 
-def lateness(joints: Array, motion: Motion) -> float:
-    """Return by how many seconds the truth must be late to come nearest."""
-    delays = np.arange(-0.03, 0.12, 0.003)
-    pose, place = motion.at((TIMES[None] - delays[:, None]).ravel())
+def truth_delayed(motion: Motion) -> Array:
+    """Return where the joints were `DELAYS` earlier: (delay, frame, 21, 3)."""
+    pose, place = motion.at((TIMES[None] - DELAYS[:, None]).ravel())
     shape = np.tile(motion.shape, (len(pose), 1))
-    late = hand_mesh(HAND, pose, shape, place, center_joint=ROOT_JOINT).joints
-    late = late.reshape(len(delays), FRAMES, 21, 3)
-    return float(delays[np.argmin([rms((joints - each)[SETTLED]) for each in late])])
+    joints = hand_mesh(HAND, pose, shape, place, center_joint=ROOT_JOINT).joints
+    return joints.reshape(len(DELAYS), FRAMES, 21, 3)
+
+
+def lateness(joints: Array, delayed: Array) -> float:
+    """Return by how many seconds the truth must be late to come nearest."""
+    return float(DELAYS[np.argmin([rms((joints - each)[SETTLED]) for each in delayed])])
 
 
 def rms(x: Array) -> float:
@@ -129,6 +133,7 @@ def rows(pace: float, seeds: range = SEEDS) -> dict[tuple[str, str], Row]:
     for seed in seeds:
         motion = Motion(seed, pace, FRAMES / RATE)
         take = see_motion(motion, HAND, TIMES, VIEWS, NOISE_PX, seed)
+        delayed = truth_delayed(motion)
         alone, together, network = fitted(take, False), fitted(take, True), network_like(take, seed)
         off, causal, offline = OFF, Smoothing("causal"), Smoothing("offline")
         for name, way, hands, done in (
@@ -141,7 +146,7 @@ def rows(pace: float, seeds: range = SEEDS) -> dict[tuple[str, str], Row]:
             ("network", "offline", network, offline),
         ):
             joints = through_the_stage(hands, take, done)
-            found.setdefault((name, way), []).append(measured(joints, take, motion))
+            found.setdefault((name, way), []).append(measured(joints, take, delayed))
     return {key: Row(*np.mean(many, axis=0)) for key, many in found.items()}
 
 

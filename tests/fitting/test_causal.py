@@ -39,7 +39,7 @@ def test_a_hand_at_rest_stays():
     np.testing.assert_allclose(follow(np.arange(20) / RATE, joints), joints, atol=1e-12)
 
 
-@pytest.mark.parametrize("sigma_m", [0.0005, 0.0015, 0.004])
+@pytest.mark.parametrize("sigma_m", [0.0005, 0.004])
 def test_a_hand_at_rest_trembles_less(sigma_m):
     """Whatever the noise; it need not be known."""
     truth = along(np.zeros((90, 3)))
@@ -49,10 +49,9 @@ def test_a_hand_at_rest_trembles_less(sigma_m):
     assert rms(np.diff(followed[30:], 2, 0)) < rms(np.diff(seen, 2, 0)) / 2.5
 
 
-@pytest.mark.parametrize("speed", [0.2, 0.5, 2.0])
-@pytest.mark.parametrize("sigma_m", [0.0, 0.0015])
+@pytest.mark.parametrize(("speed", "sigma_m"), [(0.2, 0.0015), (0.5, 0.0), (2.0, 0.0015)])
 def test_a_moving_hand_is_no_more_than_50_ms_late(speed, sigma_m):
-    time_s = np.arange(90) / RATE
+    time_s = np.arange(60) / RATE
     truth = along(speed * time_s[:, None] * [1, 0, 0])
     followed = follow(time_s, truth + tremble(truth.shape, sigma_m), 0.0015)
     late = np.mean((truth - followed)[30:, :, 0]) / speed
@@ -71,21 +70,21 @@ def test_a_jump_is_followed_at_once_and_never_overshot():
 def test_uneven_moments_give_what_even_ones_give():
     """One curve, seen at 60 moments a second, or at a third of them at random: the filter is the same."""
     rng = np.random.default_rng(0)
-    even = np.arange(180) / 60
-    some = np.sort(rng.choice(np.arange(1, 179), 60, replace=False))
+    even = np.arange(90) / 60
+    some = np.sort(rng.choice(np.arange(1, 89), 30, replace=False))
     curve = along(np.stack([0.1 * np.sin(2 * even), 0.05 * np.cos(3 * even), 0 * even], -1))
     every, few = follow(even, curve, 0.002), follow(even[some], curve[some], 0.002)
     assert np.linalg.norm(every[some] - few, axis=-1)[5:].mean() < 0.002
-    assert np.linalg.norm(curve - curve.mean(0), axis=-1).mean() > 0.05, "it is not at rest"
+    assert np.linalg.norm(curve - curve.mean(0), axis=-1).mean() > 0.03, "it is not at rest"
 
 
 def test_the_rate_of_a_hand_at_rest_is_in_seconds():
     """A hand that trembles is averaged as long at 120 moments a second as at 30: twice as well."""
     left = []
     for rate in (30, 120):
-        truth = along(np.zeros((2 * rate, 3)))
+        truth = along(np.zeros((rate, 3)))
         seen = truth + 0.002 * np.random.default_rng(0).normal(size=truth.shape)
-        left.append(rms((follow(np.arange(2 * rate) / rate, seen) - truth)[rate:]))
+        left.append(rms((follow(np.arange(rate) / rate, seen) - truth)[rate // 2 :]))
     assert left[0] / left[1] == pytest.approx(2, rel=0.25)
 
 
