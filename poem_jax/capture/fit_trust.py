@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from poem_jax.capture.robust_weight import agreement
+from poem_jax.fitting.robust_weight import agreement
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.rig import Rig
 from poem_jax.typing import Array, Float

@@ -13,7 +13,7 @@ import numpy as np
 
 from poem_jax.batch import Prediction
 from poem_jax.capture.frame import HandCrops
-from poem_jax.capture.robust_weight import agreement
+from poem_jax.fitting.robust_weight import agreement
 from poem_jax.geometry.cameras import project
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT, QueryOrder, split_queries
 from poem_jax.typing import Array, Float

@@ -6,7 +6,7 @@ import pytest
 from poem_jax.batch import Prediction
 from poem_jax.capture.frame import HandCrops
 from poem_jax.capture.network_trust import SHIPPED, Doubts, doubts_of, joint_confidence, joint_sigma
-from poem_jax.capture.robust_weight import agreement
+from poem_jax.fitting.robust_weight import agreement
 from poem_jax.geometry.cameras import project
 from poem_jax.hand.topology import NUM_JOINTS, QueryOrder, join_queries
 from tests.rigs import small_rig

@@ -40,7 +40,7 @@ def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
 def picture_sides(rig: Rig, num_frames: int | None) -> list[int]:
     """Return the longer side of each camera's pictures: all of a page together have `_PAGE_PIXELS`, but none
     is larger than its photograph, nor than a page can use, nor smaller than is worth looking at."""
-    frames = PAGE_FRAMES if num_frames is None else min(num_frames, PAGE_FRAMES)
+    frames = PAGE_FRAMES if not num_frames else min(num_frames, PAGE_FRAMES)
     shorter, longer = np.sort(rig.size_wh, axis=-1).T
     wanted = np.sqrt(_PAGE_PIXELS / (frames * rig.num_views) * longer / shorter)
     wanted = np.minimum(np.clip(wanted, _LEAST_PICTURE_PX, _LARGEST_PICTURE_PX), longer)
