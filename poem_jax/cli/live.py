@@ -14,7 +14,7 @@ from poem_jax.cli.options import File, Flag, OptionalFile, OptionalFolder
 if TYPE_CHECKING:
     from poem_jax.capture.frame import Frame
     from poem_jax.capture.live.engines import LiveEngine
-    from poem_jax.capture.live.line import Stream
+    from poem_jax.capture.live.line import Send
     from poem_jax.capture.live.pace import Pace
     from poem_jax.capture.live.viewer import LiveViewer
     from poem_jax.geometry.rig import Rig
@@ -91,7 +91,7 @@ class Live:
             finally:
                 print(pace.figures(), flush=True)
 
-    def _streams(self, opened: ExitStack) -> "list[Stream]":
+    def _streams(self, opened: ExitStack) -> "list[Send]":
         from poem_jax.capture.live.streams import UdpStream, WebsocketStream, parse_receiver
 
         streams: list[Any] = []
@@ -102,7 +102,7 @@ class Live:
             say(f"joints are sent to who connects to ws://{self.host}:{self.websocket}")
         for stream in streams:
             opened.callback(stream.close)
-        return streams
+        return [stream.send for stream in streams]
 
     def _engine(self, rig: "Rig") -> "LiveEngine":
         from poem_jax.capture.live.engines import live_fit, live_network
@@ -130,7 +130,7 @@ class Live:
         return viewer
 
     def _frames(
-        self, shots: Any, rig: "Rig", engine: "LiveEngine", streams: "Sequence[Stream]", pace: "Pace"
+        self, shots: Any, rig: "Rig", engine: "LiveEngine", streams: "Sequence[Send]", pace: "Pace"
     ) -> Any:
         from poem_jax.capture.live.line import run_line
         from poem_jax.capture.smoothing import Smoothing

@@ -1,7 +1,7 @@
 """The engines of the live line: one moment in, its hands out, with programs that are compiled beforehand.
 
-Of a hand that is fitted the shape is not known at first: it is settled together with the pose over a few
-moments that lie a while apart, and held from then on, so that later fits are of one moment alone.
+Of a hand that is fitted the shape is not known at first: it is found together with the poses of a few moments
+that lie a while apart, three times as they become more, and held; all other fits are of one moment alone.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 MOMENTS_FOR_SHAPE = 16
 """So many settle a hand's shape."""
+_SETTLED_AT = (1, 4, MOMENTS_FOR_SHAPE)
+"""When it is found anew, together with the poses of all kept moments: that takes a while."""
 _APART_S = 0.2
 """They lie so far apart at least: neighbours show the same."""
 
@@ -103,14 +105,18 @@ class _LiveHandFit:
         """Fit a moment."""
         if np.isfinite(keypoints).all(-1).any(-1).sum() < 2:
             return HandResult(np.zeros(self._rig.num_views, bool), NOT_FITTED)
-        together = [*self._kept, (keypoints, confidence)]
-        group = np.stack([seen for seen, _ in together]), np.stack([sure for _, sure in together])
-        fitted = self._fit(*group, self._shape)
-        if self._shape is None and fitted.valid[-1] and time_s - self._kept_s >= _APART_S:
-            self._kept, self._kept_s = together, time_s
-            if len(together) == MOMENTS_FOR_SHAPE:
-                self._shape, self._kept = fitted.shape[-1], []
-        return fitted_hand(fitted, len(together) - 1, joint_confidence(fitted, *group, self._rig))
+        moment = keypoints[None], confidence[None]
+        adds = len(self._kept) < MOMENTS_FOR_SHAPE and time_s - self._kept_s >= _APART_S
+        anew = self._shape is None or (adds and len(self._kept) + 1 in _SETTLED_AT)
+        together = [*self._kept, moment] if anew else [moment]
+        seen, sure = (np.concatenate(arrays) for arrays in zip(*together, strict=True))
+        fitted = self._fit(seen, sure, None if anew else self._shape)
+        if adds and fitted.valid[-1]:
+            self._kept.append(moment)
+            self._kept_s = time_s
+            if anew:
+                self._shape = fitted.shape[-1]
+        return fitted_hand(fitted, len(seen) - 1, joint_confidence(fitted, seen, sure, self._rig))
 
     def _fit(self, keypoints: Array, confidence: Array, shape: Array | None) -> "FitResult":
         size = MOMENTS_FOR_SHAPE if shape is None else 1

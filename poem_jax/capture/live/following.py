@@ -38,7 +38,8 @@ _STEP_S = 1 / 30
 _DAMPING = 0.8
 _LEAST_VOTE, _LEAST_SEEN = 1.0, 5
 """A hand has no side before its votes, log odds, or the moments that show it, are so many."""
-_MOST_VOTE, _MOST_LINK_VOTE = 6.0, 3.0
+_MOST_OF_MOMENT, _MOST_VOTE, _MOST_LINK_VOTE = 1.0, 6.0, 3.0
+"""What one moment, and all together, can say of a side; and what it can say against a hand's going on."""
 _HELD = 3.0
 """Nats for which a hand keeps its side."""
 
@@ -84,7 +85,7 @@ class _Track:
         speed = np.median(moved, axis=0) / (time_s - self.time_s) if len(moved) else np.zeros(3)
         self.velocity = _DAMPING * speed
         self.joints_world, self.time_s, self.found = now, time_s, hand.found
-        self.vote = float(np.clip(self.vote + WEIGHT_OF_VOTES * hand.vote, -_MOST_VOTE, _MOST_VOTE))
+        self.vote = float(np.clip(self.vote + _vote_of(hand), -_MOST_VOTE, _MOST_VOTE))
         self.seen += 1
 
     def merit(self, side: int) -> float:
@@ -139,8 +140,9 @@ class HandFollower:
             if number in before:
                 self._tracks[before[number]].go_on(hand, time_s)
             else:
-                vote = WEIGHT_OF_VOTES * hand.vote
-                self._tracks.append(_Track(hand.joints_world, time_s, vote, np.zeros(3), found=hand.found))
+                self._tracks.append(
+                    _Track(hand.joints_world, time_s, _vote_of(hand), np.zeros(3), found=hand.found)
+                )
 
     def _name_sides(self) -> None:
         """Give each side to the hand that it suits best; one that it does not suit at all has none."""
@@ -153,3 +155,8 @@ class HandFollower:
         for row, side in zip(*linear_sum_assignment(-usable), strict=True):
             if merit[row, side] > -SURE_LINK:
                 self._tracks[row].side = int(side)
+
+
+def _vote_of(hand: PlacedHand) -> float:
+    """Return what a moment says of the side: the views of one, and successive ones, err together."""
+    return float(np.clip(WEIGHT_OF_VOTES * hand.vote, -_MOST_OF_MOMENT, _MOST_OF_MOMENT))

@@ -1,7 +1,6 @@
 """The line of a live picture: the newest moment, its hands, calmed by those before, out; then the next."""
 
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
 
 from poem_jax.capture.detect import Detector
 from poem_jax.capture.frame import Frame
@@ -16,13 +15,8 @@ from poem_jax.capture.smoothing import Smoother, Smoothing
 from poem_jax.capture.take import Take
 from poem_jax.geometry.rig import Rig
 
-
-class Stream(Protocol):
-    """Something that messages go to."""
-
-    def send(self, message: str) -> None:
-        """Send one, and wait for nobody."""
-        ...
+Send = Callable[[str], object]
+"""Takes a message away, and waits for nobody."""
 
 
 def run_line(
@@ -31,7 +25,7 @@ def run_line(
     detector: Detector,
     engine: LiveEngine,
     smoothing: Smoothing,
-    streams: Sequence[Stream],
+    streams: Sequence[Send],
     pace: Pace,
 ) -> Iterator[Frame]:
     """Work on the newest moment as long as cameras deliver.
@@ -42,7 +36,7 @@ def run_line(
         detector: Finds hands in the images of some views.
         engine: Finds the hands in space.
         smoothing: `causal`, or `off`.
-        streams: Get the message of every moment, before it is yielded.
+        streams: Get the message of every moment, before its frame is yielded.
         pace: Is told of every moment.
 
     Returns: the frames, hands in the order of `SIDES`, as they come.
@@ -53,8 +47,8 @@ def run_line(
     frames = engine.run(find_in_moments(moments, rig, detector, pace))
     for frame in smoother.smooth(frames):
         message = message_of(frame) if streams else ""
-        for stream in streams:
-            stream.send(message)
+        for send in streams:
+            send(message)
         assert frame.time_s is not None
         pace.done(frame.time_s)
         yield frame

@@ -20,6 +20,8 @@ _SLACK = 0.05
 """Of a period, by which times tremble."""
 _SILENT_S, _SILENT_PERIODS = 2.0, 5
 """A camera that gave nothing for so long has stopped."""
+_INSTANT_S = 1e-3
+"""Not worth waiting for."""
 _LOOK_S = 0.5
 """Nothing is waited for longer than this without looking at the clock."""
 
@@ -55,12 +57,14 @@ class LiveMoments:
         while True:
             states, now = shots.states(), shots.clock()
             living = self._living(states, now)
-            period_s = max((states[view].period_s for view in living), default=0.0)
+            # Those that have just ended count, too: their last pictures are still of this moment.
+            running = [state for view, state in enumerate(states) if view not in self._silent]
+            period_s = max((state.period_s for state in running), default=0.0)
             views = self._newest(states, period_s, last_s)
             if views and waiting_since is None:
                 waiting_since = now
             patience_s = TOGETHER * period_s - (0.0 if waiting_since is None else now - waiting_since)
-            if views and (set(living) <= set(views) or patience_s <= 0):
+            if views and (set(living) <= set(views) or patience_s < _INSTANT_S):
                 chosen = {view: shot for view in views if (shot := states[view].shot) is not None}
                 dropped = self._take(chosen, first=number < 0)
                 number += 1 + dropped

@@ -2,10 +2,8 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 from poem_jax.capture.live.cameras import Cameras
-from poem_jax.capture.live.newest import NewestShots
 from poem_jax.capture.live.playback import Playback
 from poem_jax.capture.moments import Moments, find_moments
 from poem_jax.capture.video_moments import VideoMoments, open_clips
@@ -13,17 +11,8 @@ from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import name_key
 from poem_jax.io.video import VIDEO_SUFFIXES
 
-
-class Source(Protocol):
-    """Cameras that run, or seem to."""
-
-    def start(self, shots: NewestShots) -> None:
-        """Begin to leave pictures there."""
-        ...
-
-    def close(self) -> None:
-        """End."""
-        ...
+Source = Cameras | Playback
+"""Cameras that run, or seem to: `start` lets them, `close` ends them."""
 
 
 def open_source(texts: Sequence[str], rig: Rig, *, loop: bool = False) -> Source:

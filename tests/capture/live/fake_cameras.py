@@ -1,4 +1,4 @@
-"""Cameras by a clock that only the test moves, and a detector and an engine that know what is in the pictures."""
+"""Cameras by a clock that only the test moves; a detector and an engine that know what the pictures show."""
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class FakeShots(NewestShots):
 def true_joints(time_s):
     """A right and a left hand that sway, (hand, 21, 3)."""
     sway = 0.05 * np.array([np.sin(3 * time_s), np.cos(2 * time_s), 0.2])
-    places = {"right": sway + [0.12, 0.0, 0.0], "left": np.array([-0.12, 0.0, 0.02]) - sway}
+    places = {"right": np.array([0.12, 0.0, 0.0]) + sway, "left": np.array([-0.12, 0.0, 0.02]) - sway}
     return np.stack([JOINTS[side] + place for side, place in places.items()])
 
 
@@ -93,8 +93,8 @@ def seen_hands(view, joints, sides=SIDES):
 def triangulated(frame):
     """The joints of a frame's hands by its key points; None = fewer than two views."""
     keypoints = ideal_keypoints(RIG, frame.keypoints_px[None])[0]
-    joints, valid = triangulate(keypoints, RIG.K, RIG.T_cam_from_world)
-    return [hand if all_there.all() else None for hand, all_there in zip(joints, valid, strict=True)]
+    found = [triangulate(hand, RIG.K, RIG.T_cam_from_world) for hand in keypoints]
+    return [joints if valid.all() else None for joints, valid in found]
 
 
 def fake_engine(shots=None, work_s=0.0):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.live.line import run_line
+from poem_jax.capture.live.moments import Moment
 from poem_jax.capture.live.pace import Pace
 from poem_jax.capture.smoothing import Smoothing
 from tests.capture.live.fake_cameras import (
@@ -17,6 +18,8 @@ from tests.capture.live.fake_cameras import (
     planted_detector,
     true_joints,
 )
+
+AS_SEEN = Smoothing("off")
 
 
 class Kept:
@@ -30,20 +33,20 @@ class Kept:
         self.at_s.append(self._shots.now)
 
 
-def run(num_frames=40, detect_s=0.0, fit_s=0.0, smoothing=Smoothing("off"), views=range(4), sides=None):
+def run(num_frames=24, detect_s=0.0, fit_s=0.0, smoothing=AS_SEEN, views=range(4)):
     shots = FakeShots()
     for view in views:
         shots.plan(view, range(num_frames))
     pace, kept, asked = Pace(shots.clock, shots.begin_s), Kept(shots), []
-    detector = planted_detector(shots, detect_s, asked=asked, **({} if sides is None else {"sides": sides}))
-    frames = list(run_line(shots, RIG, detector, fake_engine(shots, fit_s), smoothing, [kept], pace))
+    detector = planted_detector(shots, detect_s, asked=asked)
+    frames = list(run_line(shots, RIG, detector, fake_engine(shots, fit_s), smoothing, [kept.send], pace))
     return shots, pace, kept, asked, frames
 
 
 def test_the_stream_holds_the_hands_of_its_moments():
     _, pace, kept, _, frames = run()
-    assert [message["moment"] for message in kept.messages] == list(range(40))
-    assert len(frames) == 40
+    assert [message["moment"] for message in kept.messages] == list(range(24))
+    assert len(frames) == 24
     for message in kept.messages:
         assert message["time_s"] == pytest.approx(message["moment"] * PERIOD_S, abs=1e-3)
         truth = true_joints(message["moment"] * PERIOD_S)
@@ -54,12 +57,12 @@ def test_the_stream_holds_the_hands_of_its_moments():
             np.testing.assert_allclose(hand["joints_world"], joints, atol=2e-5)
             assert hand["sigma_m"] == [0.001] * 21
     figures = pace.figures()
-    assert (figures.offered, figures.done, figures.dropped) == (40, 40, 0)
+    assert (figures.offered, figures.done, figures.dropped) == (24, 24, 0)
 
 
 def test_a_slow_detector_gets_the_newest_and_drops_are_counted():
     detect_s, fit_s = 2.4 * PERIOD_S, 0.3 * PERIOD_S
-    shots, pace, kept, asked, _ = run(100, detect_s, fit_s)
+    shots, pace, kept, asked, _ = run(60, detect_s, fit_s)
     for at_s, seen in asked:
         newest = int((at_s - shots.begin_s + 1e-9) / PERIOD_S)
         assert set(seen.values()) == {newest}
@@ -80,37 +83,37 @@ def test_a_slow_detector_gets_the_newest_and_drops_are_counted():
 def test_the_filter_looks_back_only_and_bridges():
     """The first half of a run is the same whatever follows; hands that vanish stay a moment, marked."""
     smoothing = Smoothing("causal", 0.1)
-    _, _, whole, _, _ = run(40, smoothing=smoothing)
-    _, _, part, _, _ = run(20, smoothing=smoothing)
-    assert whole.messages[:20] == part.messages
+    _, _, whole, _, _ = run(24, smoothing=smoothing)
+    _, _, part, _, _ = run(12, smoothing=smoothing)
+    assert whole.messages[:12] == part.messages
     shots = FakeShots()
     for view in range(4):
-        shots.plan(view, range(20) if view else range(40))
+        shots.plan(view, range(12) if view else range(24))
     kept = Kept(shots)
     pace = Pace(shots.clock, shots.begin_s)
-    list(run_line(shots, RIG, planted_detector(shots), fake_engine(), smoothing, [kept], pace))
+    list(run_line(shots, RIG, planted_detector(shots), fake_engine(), smoothing, [kept.send], pace))
     hands = [message["hands"]["left"] for message in kept.messages]
-    assert [hand["bridged"] for hand in hands] == [False] * 20 + [True] * 3 + [False] * (len(hands) - 23)
-    assert [hand["valid"] for hand in hands] == [True] * 23 + [False] * (len(hands) - 23)
-    assert hands[21]["joints_world"] == hands[19]["joints_world"]
-    assert hands[21]["sigma_m"] is None
+    assert [hand["bridged"] for hand in hands] == [False] * 12 + [True] * 3 + [False] * (len(hands) - 15)
+    assert [hand["valid"] for hand in hands] == [True] * 15 + [False] * (len(hands) - 15)
+    assert hands[13]["joints_world"] == hands[11]["joints_world"]
+    assert hands[13]["sigma_m"] is None
     assert hands[-1] == {"valid": False, "bridged": False, "joints_world": None, "sigma_m": None}
 
 
 def test_one_camera_places_no_hand_and_the_line_goes_on():
     _, pace, kept, _, _ = run(views=(2,))
     assert not any(hand["valid"] for message in kept.messages for hand in message["hands"].values())
-    assert pace.figures().done == 40
+    assert pace.figures().done == 24
 
 
-def test_hands_on_which_no_two_cameras_agree_are_told_once(caplog, monkeypatch):
+def test_hands_on_which_no_two_cameras_agree_are_told_once(caplog):
     shots = FakeShots()
     for view in range(4):
-        shots.plan(view, range(80))
+        shots.plan(view, range(40))
     # Each camera sees another place: their rays do not meet.
     wrong = RIG._replace(T_cam_from_world=RIG.T_cam_from_world[[1, 2, 3, 0]])
     pace = Pace(shots.clock, shots.begin_s)
-    list(run_line(shots, wrong, planted_detector(shots), fake_engine(), Smoothing("off"), [], pace))
+    list(run_line(shots, wrong, planted_detector(shots), fake_engine(), AS_SEEN, [], pace))
     told = [record.message for record in caplog.records if "agree" in record.message]
     assert len(told) == 1
     assert "check the calibration" in told[0]
@@ -118,15 +121,18 @@ def test_hands_on_which_no_two_cameras_agree_are_told_once(caplog, monkeypatch):
 
 def test_laps_and_their_words():
     shots = FakeShots()
-    for view in range(4):
-        shots.plan(view, range(300))
     pace = Pace(shots.clock, shots.begin_s)
-    laps = []
-    frames = run_line(shots, RIG, planted_detector(shots), fake_engine(), Smoothing("off"), [], pace)
     assert str(pace.figures()) == "0 moments, none done"
-    for _ in frames:
-        laps += [figures for figures in [pace.lap(3.0)] if figures is not None]
+    laps = []
+    for number in range(300):
+        shots.now = shots.begin_s + (2 * number + 1) * PERIOD_S
+        pace.begin(Moment(2 * number, 2 * number * PERIOD_S, (), min(number, 1)))
+        pace.detected()
+        pace.done(2 * number * PERIOD_S)
+        laps += [figures for figures in [pace.lap(6.0)] if figures is not None]
     assert len(laps) == 3
-    assert sum(lap.done for lap in laps) <= pace.figures().done == 300
-    assert all(lap.rate == pytest.approx(30, abs=0.5) for lap in laps)
-    assert str(laps[0]).startswith("30.0 moments/s; ")
+    assert pace.figures().offered == 599
+    assert pace.figures().dropped == 299
+    assert all(lap.rate == pytest.approx(15, abs=0.5) for lap in laps)
+    assert all(lap.latency_ms == pytest.approx((1000 * PERIOD_S,) * 2) for lap in laps)
+    assert str(laps[1]).startswith("15.0 moments/s; 90 of 180 done, 90 dropped; latency 33 ms")
