@@ -69,11 +69,11 @@ def test_moving_the_world_changes_nothing():
 
 
 @pytest.mark.parametrize("kind", [planted.clean, planted.seen_twice, planted.missed_views])
-def test_planted_scenes(kind, rig="four"):
+def test_planted_scenes(kind):
     """What is given for a hand is of that hand: 97 of 100 detections and more."""
     right = wrong = there = 0
     for seed in range(2):
-        scene = planted.planted(kind, rig, seed)
+        scene = planted.planted(kind, "four", seed)
         for frame, followed in enumerate(follow(scene.found, scene.rig, 1 / 12)):
             for view, (found, truth) in enumerate(zip(scene.found[frame], scene.truth[frame], strict=True)):
                 there += sum(t != planted.FALSE for t in truth)
