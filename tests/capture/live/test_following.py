@@ -28,7 +28,7 @@ def is_hand(followed, time_s):
 
 def test_hands_are_known_from_the_first_moment_in_whatever_order_they_are_found():
     rng = np.random.default_rng(0)
-    frames = [views_of(i * PERIOD_S, order=rng.permutation(2)) for i in range(20)]
+    frames = [views_of(i * PERIOD_S, order=rng.permutation(2)) for i in range(8)]
     for number, followed in enumerate(follow(frames)):
         assert is_hand(followed, number * PERIOD_S) == [True, True]
         np.testing.assert_array_equal(followed.score, 0.9)
@@ -36,23 +36,23 @@ def test_hands_are_known_from_the_first_moment_in_whatever_order_they_are_found(
 
 
 def test_wrong_sides_for_a_while_exchange_nothing():
-    frames = [views_of(i * PERIOD_S, SIDES if i < 10 or i > 13 else SIDES[::-1]) for i in range(20)]
+    frames = [views_of(i * PERIOD_S, SIDES if i < 5 or i > 7 else SIDES[::-1]) for i in range(10)]
     for number, followed in enumerate(follow(frames)):
         assert is_hand(followed, number * PERIOD_S) == [True, True]
 
 
 def test_what_comes_later_changes_nothing():
-    frames = [views_of(i * PERIOD_S) for i in range(12)]
-    for one, other in zip(follow(frames), follow(frames[:6]), strict=False):
+    frames = [views_of(i * PERIOD_S) for i in range(8)]
+    for one, other in zip(follow(frames), follow(frames[:4]), strict=False):
         np.testing.assert_array_equal(one.keypoints_px, other.keypoints_px)
 
 
 def test_a_hand_that_leaves_comes_back_as_itself():
-    gone = [[[hand for hand in seen if hand.side == "left"] for seen in views_of(i * 0.1)] for i in range(30)]
-    frames = [gone[i] if 5 <= i < 20 else views_of(i * 0.1) for i in range(30)]
+    gone = [[[hand for hand in seen if hand.side == "left"] for seen in views_of(i * 0.1)] for i in range(18)]
+    frames = [gone[i] if 3 <= i < 15 else views_of(i * 0.1) for i in range(18)]
     for number, followed in enumerate(follow(frames, period_s=0.1)):
         seen = is_hand(followed, number * 0.1)
-        assert seen == [not 5 <= number < 20, True]
+        assert seen == [not 3 <= number < 15, True]
         if not seen[0]:
             assert np.isnan(followed.keypoints_px[0]).all()
             assert np.isnan(followed.score[0]).all()
