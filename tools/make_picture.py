@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from poem_jax.capture.demo import demo_folder, demo_truth
+from poem_jax.capture.demo import demo_folder
 from poem_jax.data.lens import project_raw
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import unit_vectors
@@ -43,13 +43,9 @@ class Found(NamedTuple):
 
 
 def read_found(folder: Path) -> Found:
-    """Read `prediction.npz`; its hands are told apart by the truth, since it names no sides."""
-    truth = demo_truth()
+    """Read `prediction.npz`."""
     with np.load(folder / "prediction.npz") as stored:
-        vertices = stored["vertices_world"]
-    middle = np.nanmean(vertices, axis=(0, 2))[:, None] - truth.vertices_world.mean((0, 2))[None]
-    nearest = np.linalg.norm(middle, axis=-1).argmin(1)
-    return Found(tuple(truth.sides[hand] for hand in nearest), vertices)
+        return Found(tuple(map(str, stored["hand_side"])), stored["vertices_world"])
 
 
 def read_video(path: Path) -> list[np.ndarray]:

@@ -88,6 +88,7 @@ def engine_for(take: Take, name: EngineName | str, options: EngineOptions) -> Ch
     else:
         engine = makers[choice.engine]()
     _log.info("engine: %s, by %s: %s", choice.engine, choice.by, choice.why)
+    _warn_of_unused(choice.engine, options)
     return Chosen(engine, choice, take)
 
 
@@ -98,6 +99,18 @@ def _check_options(name: EngineName | str, options: EngineOptions) -> None:
         raise ValueError("`checkpoint` and `network` are for the engine poem; a fit has no weights")
     if name == "poem" and (options.hand is not None or options.detector is not None):
         raise ValueError("`hand` and `detector` are for the engine fit; poem has its own hand")
+
+
+def _warn_of_unused(taken: str, options: EngineOptions) -> None:
+    """Say which options the engine that was taken makes no use of."""
+    of_poem = {"checkpoint": options.checkpoint, "network": options.network}
+    of_fit = {"hand (--mano)": options.hand, "detector": options.detector}
+    unused = [name for name, value in (of_poem if taken == "fit" else of_fit).items() if value is not None]
+    if unused:
+        _log.warning(
+            "the engine is %s, which makes no use of %s; ask for the other one by --engine",
+            *(taken, " and ".join(unused)),
+        )
 
 
 def _only_one(keypoints: bool, images: bool, anything: bool) -> EngineChoice | None:

@@ -19,7 +19,7 @@ from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.fit_trust import joint_confidence
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames, padded_times
-from poem_jax.capture.frame_times import times_of
+from poem_jax.capture.frame_times import SECONDS_PER_FRAME, times_of
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
 from poem_jax.capture.take import Take
 from poem_jax.fitting.detector_offsets import offsets_of
@@ -73,7 +73,7 @@ def fit_hands(
     for group, turns in _windows(frames, _CONTEXT if smooth else 0):
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
-        time_s = times_of(group)
+        time_s = times_of(group) if smooth else np.arange(len(group)) * SECONDS_PER_FRAME
         if not checked and shows_palms(raw):
             check_triangulation(take.rig, raw)
             checked = True
@@ -107,9 +107,10 @@ def try_fit(
     config = fit_config(take.rig, smooth=False)
     offsets = offsets_of(take.detector if detector is None else detector)
     fitted, trusted = [], []
+    evenly = np.arange(len(group)) * SECONDS_PER_FRAME
     for index, side in enumerate(take.hand_sides):
         given, model = (keypoints[:, index], confidence[:, index]), _keypoint_models(hands, side, offsets)[0]
-        fitted.append(fit_group(model, *given, times_of(group), take.rig, config, None))
+        fitted.append(fit_group(model, *given, evenly, take.rig, config, None))
         trusted.append(joint_confidence(fitted[-1], *given, take.rig))
     yield from _with_results(group, range(len(group)), fitted, trusted)
 

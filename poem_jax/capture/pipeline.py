@@ -7,7 +7,9 @@ many frames there are need not be known, and memory does not grow with them.
 """
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 

@@ -30,6 +30,7 @@ LIVE, BOTH_WAYS = FilterConfig(), FilterConfig()
 _AHEAD, _TOGETHER = 8, 4
 """Frames that are looked ahead at, and that are smoothed at a time: so many are held, with their images."""
 _ROUNDING_S = 1e-6
+MAX_BRIDGE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,11 @@ class Smoothing:
     """A hand is bridged where it was last seen so many seconds ago at most; 0 = never."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.bridge_s < float("inf"):
-            raise ValueError(f"a hand must be bridged for 0 seconds or more; got {self.bridge_s}")
+        if not 0 <= self.bridge_s <= MAX_BRIDGE_S:
+            raise ValueError(
+                f"a hand can be bridged for 0 to {MAX_BRIDGE_S:g} s, since frames wait with their images for "
+                f"so long; got {self.bridge_s}"
+            )
 
 
 OFF = Smoothing()

@@ -32,6 +32,8 @@ from poem_jax.typing import Array, Float, Int
 from poem_jax.viz.page import Caption, write_page
 
 PREDICTION, REPORT, PAGE = "prediction.npz", "report.json", "index.html"
+OVERLAYS = "overlays"
+"""Folder of the overlay videos, apart from a capture's own, should both be in one place."""
 
 _log = logging.getLogger(__name__)
 
@@ -147,7 +149,7 @@ class _Writer:
         self._drawn = {name: Drawn(style.faces[side], side) for name, side in sides}
         chosen = style.formats & {Format.VIDEO, Format.PNG}
         self._overlays = chosen or {Format.VIDEO if is_long(take.num_frames) else Format.PNG}
-        self._videos = OverlayVideos([out / f"overlay_{name}.mp4" for name in take.rig.names])
+        self._videos = OverlayVideos([out / OVERLAYS / f"{name}.mp4" for name in take.rig.names])
         self._gallery = make_gallery(take.rig, take.num_frames)
         self._pages = PageFrames()
 
@@ -175,11 +177,13 @@ class _Writer:
         self.files.append(self._prediction.write())
         exported: Mapping[str, Any] = {}
         try:
-            exported = self._write_exports()
             self.files += self._videos.finish()
         finally:
-            self._write_page(about)
-            self.files.append(self.report.write(clock.rounded(), {**about, **exported}))
+            try:
+                exported = self._write_exports()
+            finally:
+                self._write_page(about)
+                self.files.append(self.report.write(clock.rounded(), {**about, **exported}))
 
     def close(self) -> None:
         """Let go of what is not needed any more."""
@@ -245,8 +249,8 @@ def frame_folder(out: Path, name: str) -> Path:
         ValueError: The name cannot be that of a folder, belongs to a file of the take, or is a link that
             leads elsewhere.
     """
-    if safe_file_name(name, "a frame's name") in {path.name for path in take_files(out)}:
-        raise ValueError(f"a frame cannot be called {name!r}: a file of the results has this name")
+    if safe_file_name(name, "a frame's name") in {OVERLAYS, *(path.name for path in take_files(out))}:
+        raise ValueError(f"a frame cannot be called {name!r}: one of the results has this name")
     folder = out / name
     if folder.is_symlink():
         raise ValueError(f"{folder} is a link that leads out of the folder of results: give another --out")

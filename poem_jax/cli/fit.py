@@ -117,6 +117,8 @@ def smoothing_of(smooth: bool, causal: bool, bridge: float | None) -> "Smoothing
 
     if bridge is not None and not (smooth or causal):
         raise ValueError("--bridge goes with --smooth or --causal; add one of them")
+    if smooth and causal:
+        raise ValueError("--smooth looks ahead and --causal does not; give one of them")
     mode = "causal" if causal else "offline" if smooth else "off"
     return Smoothing(mode) if bridge is None else Smoothing(mode, bridge)
 

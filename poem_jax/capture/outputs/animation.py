@@ -43,9 +43,13 @@ def write_animation(
         vertices_of: Gives the vertices of a frame and a hand (numbers), metres, from the motion's origin.
         faces: Triangles by side.
 
-    Returns: for the report, per hand how it moves and how far that is from what the engine gave.
+    The animation begins with the take's first frame, whenever that was.
+
+    Returns: for the report, when that was, and per hand how it moves and how far that is from what the engine
+        gave.
     """
-    said: dict[str, Any] = {}
+    time_s = motion.time_s - motion.time_s[0]
+    said: dict[str, Any] = {"begins_at_s": float(motion.time_s[0])}
     with Glb() as glb:
         upright = quaternion_from_rotation(motion.R_upright_from_world)[[1, 2, 3, 0]].tolist()
         below: list[int] = []
@@ -59,11 +63,10 @@ def write_animation(
             error = _skin_error_m(hand, vertices)
             rgb = HAND_RGB[hand.side]
             if error is not None and error <= MAX_SKIN_ERROR_M:
-                mesh, wrist = add_skinned_mesh(glb, hand.name, rgb, *_skinned(hand, motion.time_s))
+                mesh, wrist = add_skinned_mesh(glb, hand.name, rgb, *_skinned(hand, time_s))
                 glb.roots.append(mesh)
                 below.append(wrist)
             else:
-                time_s = motion.time_s
                 nodes = add_morphing_mesh(glb, hand.name, faces[hand.side], rgb, vertices, hand.seen, time_s)
                 below += nodes
             said[hand.name] = _said(hand, error)

@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from poem_jax.capture.frame_times import SECONDS_PER_FRAME
 from poem_jax.geometry.transforms import rotate_points, rotation_from_axis_angle
 from poem_jax.hand.bones import bone_lengths, rotations_of_joints, shape_of_bones
 from poem_jax.hand.model import HandModel, ShapedHand
 from poem_jax.hand.topology import WRIST
 from poem_jax.typing import Array, Bool, Float
 
-SECONDS_PER_FRAME = 1 / 30
-"""Of a take that does not say when its frames were taken: what video cameras take."""
 _LENGTHS_FROM = 500
 """Frames, spread over the take, of which the bones are measured."""
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from poem_jax.capture.frame import Frame
+from poem_jax.capture.frame_times import SECONDS_PER_FRAME
 from poem_jax.data.lens import project_raw
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.atomic import whole_file
@@ -17,8 +18,6 @@ from poem_jax.typing import Array, Float, Int, UInt8
 from poem_jax.viz.overlay import MeshInView, draw_overlay
 from poem_jax.viz.page import HAND_RGB
 
-FRAMES_PER_SECOND = 30.0
-"""Of a take that does not say when its frames were taken."""
 _CODEC = "mp4v"
 
 
@@ -100,7 +99,7 @@ class OverlayVideos:
 
     def _begin(self, second_s: float | None) -> None:
         known = self._first_s is not None and second_s is not None and second_s > self._first_s
-        self._rate = 1 / (second_s - self._first_s) if known else FRAMES_PER_SECOND  # pyright: ignore
+        self._rate = 1 / (second_s - self._first_s) if known else 1 / SECONDS_PER_FRAME  # pyright: ignore
         assert self._waiting is not None
         self._append(self._waiting)
         self._waiting = None

@@ -59,7 +59,10 @@ def page_facts(report: Report, frames: Iterable[PageFrame]) -> dict[str, str]:
 
 
 def _seen_px(frame: Frame, index: int) -> Float[Array, "view 21 2"] | None:
-    """Return where a hand's joints were seen in the photographs: as given, else by a network's heat maps."""
+    """Return where a hand's joints were seen in the photographs: as given, else by a network's heat maps;
+    None of a bridged hand, which was not seen."""
+    if frame.hands[index].bridged:
+        return None
     if frame.keypoints_px is not None:
         return frame.keypoints_px[index]
     by_network = frame.hands[index].keypoints_px

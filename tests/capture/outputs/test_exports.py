@@ -13,7 +13,7 @@ from poem_jax.capture.report import Clock
 from poem_jax.capture.write import Style, write_results
 from tests.capture.outputs.conftest import HANDS
 
-OVERLAYS = ("overlay_left_cam.mp4", "overlay_front.mp4", "overlay_cam 3.mp4")
+OVERLAYS = ("overlays/left_cam.mp4", "overlays/front.mp4", "overlays/cam 3.mp4")
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +64,7 @@ def test_overlays_of_a_long_take_are_videos(planted, tmp_path, monkeypatch):
     assert not any(name.endswith(".png") for name in long)
     both = run(planted(), tmp_path / "c", frozenset({Format.VIDEO, Format.PNG}), pictures=True)
     assert one | set(OVERLAYS) <= both
-    video = cv2.VideoCapture(str(tmp_path / "b" / "overlay_front.mp4"))
+    video = cv2.VideoCapture(str(tmp_path / "b" / "overlays" / "front.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 25
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(25)
 
@@ -90,8 +90,9 @@ def test_a_file_that_cannot_be_written_costs_itself_alone(planted, tmp_path, mon
 
     monkeypatch.setattr(exports, "write_markers", full)
     with pytest.raises(OSError, match="no space left"):
-        run(planted(), tmp_path, frozenset({Format.CSV, Format.TRC}))
+        run(planted(), tmp_path, frozenset({Format.CSV, Format.TRC, Format.VIDEO}), pictures=True)
     assert (tmp_path / "joints.csv").exists()
+    assert (tmp_path / "overlays" / "front.mp4").exists()
     assert json.loads((tmp_path / "report.json").read_text())["num_frames"] == 9
     with np.load(tmp_path / "prediction.npz") as stored:
         assert len(stored["time_s"]) == 9
