@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from poem_jax.cli.detect import where_hands_are
-from poem_jax.cli.fit import hand_from
+from poem_jax.cli.fit import hand_from, smoothing_of
 from poem_jax.cli.messages import print_files, print_summary, say, tells_what_is_left
 from poem_jax.cli.options import (
     Bridge,
