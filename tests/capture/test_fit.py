@@ -303,6 +303,15 @@ def test_of_both_engines_the_better_one_is_taken(files, fitted, tmp_path):
     )
 
 
+def test_a_fit_that_is_not_smoothed_asks_for_no_times(take):
+    """A file of key points may know when some of its frames were taken."""
+    frames = [frame._replace(time_s=9.0 if i == 2 else None) for i, frame in enumerate(take.frames)]
+    found = fit_hands(iter(frames), take, hands_of(default_hand()))
+    assert all(hand.reason is None for frame in found for hand in frame.hands)
+    with pytest.raises(ValueError, match="must have times, or none"):
+        list(fit_hands(iter(frames), take, hands_of(default_hand()), smooth=True))
+
+
 def test_a_key_point_that_is_off_is_not_borne_out(take):
     """0 for the one that no other view agrees with, about 0.9 for the others, NaN for those unseen."""
     keypoints = take.frames.hands.keypoints_px.copy()

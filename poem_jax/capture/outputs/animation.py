@@ -45,11 +45,10 @@ def write_animation(
 
     The animation begins with the take's first frame, whenever that was.
 
-    Returns: for the report, when that was, and per hand how it moves and how far that is from what the engine
-        gave.
+    Returns: for the report, per hand how it moves and how far that is from what the engine gave.
     """
     time_s = motion.time_s - motion.time_s[0]
-    said: dict[str, Any] = {"begins_at_s": float(motion.time_s[0])}
+    said: dict[str, Any] = {}
     with Glb() as glb:
         upright = quaternion_from_rotation(motion.R_upright_from_world)[[1, 2, 3, 0]].tolist()
         below: list[int] = []

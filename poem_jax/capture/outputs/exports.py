@@ -86,6 +86,7 @@ def write_exports(
             return vertices[frame, hand] - origin_world
 
         about["animation"] = write_animation(out / ANIMATION, motion, vertices_of, faces)
+        about["animation_begins_s"] = float(motion.time_s[0])
         files.append(out / ANIMATION)
     if Format.BVH in formats:
         seen = [hand for hand in motion.hands if hand.skeleton is not None]

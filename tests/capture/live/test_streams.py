@@ -101,7 +101,7 @@ def test_a_port_in_use_is_one_clear_error():
 
 @pytest.mark.parametrize("text", ["9000", "host:", ":9000", "host:x", "host:0", "host:65536"])
 def test_receivers_that_are_none(text):
-    with pytest.raises(ValueError, match="--udp must be HOST:PORT, as 127.0.0.1:9000"):
+    with pytest.raises(ValueError, match=r"--udp must be HOST:PORT, as 127\.0\.0\.1:9000"):
         parse_receiver(text)
 
 

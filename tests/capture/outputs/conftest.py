@@ -56,7 +56,7 @@ def planted_take(count=9, *, pose=True, uneven=False, far=False):
     keys[:, 1, :, 1:] *= -1
     keys[:, :, 0] = rng.normal(size=(4, 2, 3))
     steps = rng.uniform(0.5, 1.5, count) if uneven else np.ones(count)
-    time_s = np.cumsum(steps) / 25
+    time_s = 1e6 + np.cumsum(steps) / 25
     place = (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     poses = CubicSpline([0, 0.3, 0.7, 1.0], keys)(place)
     shape, spots = rng.normal(size=(2, 10)), rng.uniform(-0.1, 0.1, (count, 2, 3))

@@ -68,6 +68,14 @@ def test_errors_are_those_of_what_the_detector_should_see(rig):
     np.testing.assert_array_equal(page.hands["right"].joints_world, joints())
 
 
+def test_a_bridged_hand_has_no_errors(rig):
+    """One view may have seen it, which is too few to find it."""
+    seen = np.stack([seen_by(rig, joints())] * 2)
+    page, _ = made(rig, frame_of(rig, found(joints(), bridged=True), keypoints_px=seen))
+    assert page.hands["right"].error_px is None
+    assert page.hands["right"].keypoints_px is None
+
+
 def test_a_network_that_sees_the_root_alone(rig):
     roots = seen_by(rig, joints())[:, [ROOT_JOINT]]
     page, _ = made(rig, frame_of(rig, found(joints(), keypoints_px=roots)))
