@@ -42,16 +42,20 @@ def judge_time(
 def late_cameras(rig: Rig, offsets: TimeOffsets, time_s: Float[Array, " frame"] | None) -> Finding:
     """Return the finding that names the cameras which are off, by how much, and what it explains."""
     step_s = None if time_s is None else frame_step_s(time_s)
-    moments = []
+    moments, seconds_late = [], []
     for name, frames in zip(rig.names, offsets.frames, strict=True):
         if abs(frames) >= LATE_FRAMES:
             seconds = "" if step_s is None else f" ({1000 * frames * step_s:+.0f} ms)"
             moments.append(f"'{name}' {frames:+.2f} frames{seconds}")
+            seconds_late.append(f"{name}={0 if step_s is None else frames * step_s:.4f}")
     return Finding(
         TIME_OFFSET,
         f"the cameras' frames are not of one moment: {', '.join(moments)} after the others' frames of the "
         f"same number (minus: before); so the key points lie {offsets.error_px:.1f} px off each other's "
         f"epipolar lines, as given {offsets.given_px:.1f} px (worst pair, median)",
-        "shift these cameras' frames by as much, or record with cameras that are triggered together",
+        "shift these cameras' frames by as much, or record with cameras that are triggered together"
+        if step_s is None
+        else f"add --offsets {','.join(seconds_late)} to those in use (or to sync.json), and search the videos "
+        "anew",
         fatal=False,
     )

@@ -1,6 +1,7 @@
 """A calibration's check from files to files: rig and key points in, findings, report and pictures out."""
 
 import json
+import logging
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -10,9 +11,11 @@ import numpy as np
 from poem_jax.calibration.epipolar import epipolar_distances_px, ideal_keypoints
 from poem_jax.calibration.findings import Finding
 from poem_jax.calibration.meeting_points import meeting_points, near_rig
+from poem_jax.calibration.view_agreement import spread_frames
 from poem_jax.capture.calibration_check import check_calibration
 from poem_jax.capture.read import read_views
 from poem_jax.capture.take import read_keypoint_take
+from poem_jax.capture.timing import Timing
 from poem_jax.data.capture_folder import FramePaths, find_rig
 from poem_jax.data.lens import project_raw
 from poem_jax.geometry.rig import Rig
@@ -21,6 +24,8 @@ from poem_jax.io.atomic import whole_file
 from poem_jax.io.writable import check_folder_is_writable
 from poem_jax.typing import Array, Float
 from poem_jax.viz.rig_picture import draw_keypoints, draw_rig, write_picture
+
+_log = logging.getLogger(__name__)
 
 _PICTURED_FRAMES = 3
 _PICTURED_HANDS = 6
@@ -45,6 +50,7 @@ def check_files(
     keypoints: str | os.PathLike | None,
     images: str | os.PathLike | None,
     out: str | os.PathLike | None,
+    timing: Timing | None = None,
 ) -> CheckReport:
     """Check a calibration and write report and pictures.
 
@@ -52,7 +58,9 @@ def check_files(
         rig_file: The calibration.
         keypoints: File of key points; None = the rig is looked at by itself.
         images: Capture folder to draw on; None = no images.
-        out: Folder for `report.json`, `rig.png` and `<frame>_<camera>.jpg`; None = nothing is written.
+        out: Folder for `report.json`, `rig.png` and `<frame>_<camera>.jpg`; None = nothing is written. An
+            image that cannot be read is told, and not drawn on.
+        timing: The cameras' offsets, for the images.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -73,30 +81,31 @@ def check_files(
             "cameras see is told by key points of hands (--keypoints, --images or --videos)"
         )
         return _written(CheckReport(findings, summary), rig, None, None, out)
-    rig, hands, footage, time_s = read_rig_and_hands(rig_file, keypoints, images)
+    rig, hands, footage, time_s = read_rig_and_hands(rig_file, keypoints, images, timing)
     findings = check_calibration(rig, hands, time_s)
-    pairs = epipolar_distances_px(rig, ideal_keypoints(rig, hands[:_MOST_FRAMES]))
-    worst = float(np.nanmax(pairs)) if np.isfinite(pairs).any() else np.nan
-    summary = (
-        f"nothing is wrong: the key points of {len(hands)} frames lie at most {worst:.1f} px off each "
-        "other's epipolar lines (worst pair of cameras, median)"
-    )
+    some = spread_frames(hands)
+    pairs = epipolar_distances_px(rig, ideal_keypoints(rig, some))
+    summary = f"nothing was found, but no two cameras share enough key points in {len(some)} frames to tell"
+    if np.isfinite(pairs).any():
+        summary = (
+            f"nothing is wrong: the key points of {len(some)} frames lie at most {np.nanmax(pairs):.1f} px "
+            "off each other's epipolar lines (worst pair of cameras, median)"
+        )
     return _written(CheckReport(findings, summary), rig, hands, footage, out)
 
 
-_MOST_FRAMES = 400
-"""Of which the pairs' distances are told."""
-
-
 def read_rig_and_hands(
-    rig_file: str | os.PathLike, keypoints: str | os.PathLike, images: str | os.PathLike | None
+    rig_file: str | os.PathLike,
+    keypoints: str | os.PathLike,
+    images: str | os.PathLike | None,
+    timing: Timing | None = None,
 ) -> tuple[Rig, Float[Array, "frame hand view 21 2"], _Footage, Float[Array, " frame"] | None]:
     """Read a rig and the key points of its cameras, in the rig's order.
 
     Returns: the rig, key points in pixels of the raw images (NaN = unseen), the frames' names and images, and
         their times in seconds, None where they are not known.
     """
-    take = read_keypoint_take(keypoints, rig_file, images)
+    take = read_keypoint_take(keypoints, rig_file, images, timing)
     frames = list(take.frames)
     points = [frame.keypoints_px for frame in frames if frame.keypoints_px is not None]
     times = [frame.time_s for frame in frames if frame.time_s is not None]
@@ -125,6 +134,8 @@ def _written(
         "frames": 0 if hands is None else len(hands),
         "pairs_px": None if rig is None or hands is None else _pairs(rig, hands),
     }
+    with whole_file(folder / "report.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
     if rig is not None:
         joints = np.zeros((0, 21, 3)) if hands is None else _joints_world(rig, hands)
         some = joints[np.linspace(0, len(joints) - 1, min(len(joints), _PICTURED_HANDS)).astype(int)]
@@ -133,14 +144,12 @@ def _written(
         write_picture(folder / "rig.png", draw_rig(rig, some, suspected))
         if hands is not None and footage is not None:
             _draw_frames(rig, hands, joints, footage, folder)
-    with whole_file(folder / "report.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
     return report
 
 
 def _pairs(rig: Rig, hands: Array) -> dict[str, float]:
     """Return the median distance from each other's epipolar lines of every pair of cameras that is judged."""
-    distances = epipolar_distances_px(rig, ideal_keypoints(rig, hands[:_MOST_FRAMES]))
+    distances = epipolar_distances_px(rig, ideal_keypoints(rig, spread_frames(hands)))
     return {
         f"{rig.names[a]} {rig.names[b]}": round(float(distances[a, b]), 3)
         for a in range(rig.num_views)
@@ -165,8 +174,8 @@ def _draw_frames(rig: Rig, hands: Array, joints: Array, footage: _Footage, folde
     for index in (pictured[i] for i in chosen):
         for view, image in enumerate(read_views(footage.images[index].images, rig)):
             if isinstance(image, FileNotFoundError | ValueError):
-                raise image
-            if image is None:
+                _log.warning("frame %s is not drawn on: %s", footage.names[index], image)
+            if not isinstance(image, np.ndarray):
                 continue
             together = np.stack([project_raw(rig, view, hand)[0] for hand in by_frame[index]])
             off = np.linalg.norm(together - hands[index, :, view], axis=-1)

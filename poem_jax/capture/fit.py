@@ -19,7 +19,7 @@ from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.fit_trust import joint_confidence
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames, padded_times
-from poem_jax.capture.frame_times import SECONDS_PER_FRAME, times_of
+from poem_jax.capture.frame_times import SECONDS_PER_FRAME, known_times, times_of
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
 from poem_jax.capture.take import Take
 from poem_jax.fitting.detector_offsets import offsets_of
@@ -77,7 +77,11 @@ def fit_hands(
         if not checked and shows_palms(raw):
             check_triangulation(take.rig, raw)
             checked = True
-        warnings = [] if said else [str(finding) for finding in judge_views(take.rig, raw)]
+        warnings = (
+            []
+            if said
+            else [str(finding) for finding in judge_views(take.rig, raw, time_s=known_times(group))]
+        )
         said = said or bool(warnings)
         if not told:
             lost = np.isfinite(raw).all(-1) & ~np.isfinite(keypoints).all(-1)

@@ -1,6 +1,7 @@
 """When the frames of a stream were taken: as they say, or one after the other at the rate of video."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,6 +38,13 @@ def timed(frames: Iterable[Frame]) -> Iterator[tuple[float, Frame]]:
             )
         last = moment, frame
         yield last
+
+
+def known_times(frames: Sequence[Frame]) -> Float[np.ndarray, " frame"] | None:
+    """Return the frames' own moments, seconds; None where they do not all have one, later and later."""
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    known = len(times) == len(frames) and all(a < b for a, b in pairwise(times))
+    return np.array(times) if known else None
 
 
 def times_of(frames: Sequence[Frame]) -> Float[np.ndarray, " frame"]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from poem_jax.cli.messages import say
-from poem_jax.cli.options import File, Flag, OptionalFile, OptionalFolder
+from poem_jax.cli.options import File, Flag, MomentOptions, Moments, OptionalFile, OptionalFolder
 
 FAULTY = 1
 """Exit code of a check that found something."""
@@ -32,6 +32,11 @@ class Check:
     """Capture folder whose images are searched for hands first, and drawn on."""
     videos: OptionalFolder = None
     """Folder of one video per camera, likewise."""
+    max_hands: int = 2
+    """Hands that are looked for."""
+    video: Flag = False
+    """As for `poem detect`."""
+    moments: MomentOptions = Moments()
     out: OptionalFolder = None
     """Folder for report.json, rig.png, and pictures with the key points where there are images."""
     debug: Flag = False
@@ -44,7 +49,8 @@ class Check:
         footage = self.images or self.videos
         if self.images is not None and self.videos is not None:
             raise ValueError("give --images or --videos, not both")
-        report = check_files(self.rig, self._keypoints(footage), footage, self.out)
+        timing = self.moments.timing()
+        report = check_files(self.rig, self._keypoints(footage), footage, self.out, timing)
         for finding in report.findings:
             print(f"{finding.name}: {finding}")
         if not report.findings:
@@ -67,7 +73,7 @@ class Check:
 
         check_folder_is_writable(self.out)
         self.out.mkdir(parents=True, exist_ok=True)
-        find_keypoints(footage, self.out / FOUND_FILE, self.rig)
+        find_keypoints(footage, self.out / FOUND_FILE, self.rig, self.max_hands, self.video, self.moments)
         return self.out / FOUND_FILE
 
 

@@ -52,6 +52,11 @@ def where_hands_are(
     if max_hands < 1:
         raise ValueError(f"--max-hands must be 1 or more; got {max_hands}")
     if (given := boxes_beside(folder)) is not None:
+        if moments.offsets is not None:
+            raise ValueError(
+                f"--offsets is for a search, and hands are where {given} says, found under the offsets of then; "
+                "move that file away to search again, or leave --offsets out"
+            )
         say(f"hands are where {given} says")
         return given
     found = out / FOUND_FILE

@@ -71,7 +71,7 @@ class Fit:
         """Write the results and print where they are."""
         from poem_jax.capture.outputs.formats import formats_of
         from poem_jax.capture.pipeline import fit
-        from poem_jax.capture.take import read_keypoint_take
+        from poem_jax.capture.take import boxes_beside, read_keypoint_take
         from poem_jax.capture.write import take_files
         from poem_jax.io.writable import check_folder_is_writable, check_inputs_stay
 
@@ -81,8 +81,14 @@ class Fit:
         check_inputs_stay(take_files(self.out), (self.keypoints, self.rig, self.mano))
         hand = hand_from(self.mano)
         keypoints, images = self.keypoints, self.images
-        if self.moments.are_part and not keypoints.is_dir():
-            raise ValueError(f"--start, --end and --every are for a capture's folder; {keypoints} is a file")
+        given = boxes_beside(keypoints) if keypoints.is_dir() else keypoints
+        if self.moments.are_part and given is not None:
+            raise ValueError(
+                f"--start, --end and --every are for a search, and all frames of {given} are fitted; leave them "
+                "out"
+            )
+        if self.moments.offsets is not None and not keypoints.is_dir() and images is None:
+            raise ValueError("--offsets is for images, and there are none: add --images, or leave it out")
         if keypoints.is_dir():
             if images is not None:
                 raise ValueError(

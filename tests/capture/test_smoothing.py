@@ -292,8 +292,10 @@ def test_jitter_of_a_steady_motion_is_none_whatever_the_times():
 def test_the_options_of_the_commands():
     assert smoothing_of(False, False, None) == Smoothing("off")
     assert smoothing_of(True, False, None) == Smoothing("offline")
-    assert smoothing_of(True, True, 0.5) == Smoothing("causal", 0.5)
+    assert smoothing_of(False, True, 0.5) == Smoothing("causal", 0.5)
+    with pytest.raises(ValueError, match="give one of them"):
+        smoothing_of(True, True, None)
     with pytest.raises(ValueError, match="--bridge goes with"):
         smoothing_of(False, False, 0.5)
-    with pytest.raises(ValueError, match="0 seconds or more"):
+    with pytest.raises(ValueError, match="bridged for 0 to 1 s"):
         smoothing_of(True, False, -1.0)
