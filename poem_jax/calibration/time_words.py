@@ -55,7 +55,7 @@ def late_cameras(rig: Rig, offsets: TimeOffsets, time_s: Float[Array, " frame"] 
         f"epipolar lines, as given {offsets.given_px:.1f} px (worst pair, median)",
         "shift these cameras' frames by as much, or record with cameras that are triggered together"
         if step_s is None
-        else f"add --offsets {','.join(seconds_late)} to those in use (or to sync.json), and search the videos "
-        "anew",
+        else f"add --offsets {','.join(seconds_late)} to those in use (or to sync.json), and search the "
+        "videos anew",
         fatal=False,
     )

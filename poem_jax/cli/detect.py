@@ -54,8 +54,8 @@ def where_hands_are(
     if (given := boxes_beside(folder)) is not None:
         if moments.offsets is not None:
             raise ValueError(
-                f"--offsets is for a search, and hands are where {given} says, found under the offsets of then; "
-                "move that file away to search again, or leave --offsets out"
+                f"--offsets is for a search, and hands are where {given} says, found under the offsets of "
+                "then; move that file away to search again, or leave --offsets out"
             )
         say(f"hands are where {given} says")
         return given

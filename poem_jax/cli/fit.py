@@ -84,8 +84,8 @@ class Fit:
         given = boxes_beside(keypoints) if keypoints.is_dir() else keypoints
         if self.moments.are_part and given is not None:
             raise ValueError(
-                f"--start, --end and --every are for a search, and all frames of {given} are fitted; leave them "
-                "out"
+                f"--start, --end and --every are for a search, and all frames of {given} are fitted; leave "
+                "them out"
             )
         if self.moments.offsets is not None and not keypoints.is_dir() and images is None:
             raise ValueError("--offsets is for images, and there are none: add --images, or leave it out")

@@ -83,8 +83,8 @@ def test_a_signal_ends_it_with_a_summary(planted, capsys, kind, code):
 
 def test_it_ends_after_so_many_seconds(planted, capsys):
     _, arguments = planted(30)
-    assert main([*arguments, "--seconds", "0.1"]) == 0
-    assert "4 of 4 done" in capsys.readouterr().out
+    assert main([*arguments, "--seconds", "0.12"]) == 0
+    assert "5 of 5 done" in capsys.readouterr().out
 
 
 def test_a_port_in_use_and_other_wrong_options(planted, capsys):

@@ -4,6 +4,7 @@ import logging
 import os
 import threading
 from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 
@@ -19,6 +20,16 @@ _CLOSE_S = 2.0
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 _log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class _Capture(Protocol):
+    """A camera as OpenCV gives it (`cv2.VideoCapture`)."""
+
+    def isOpened(self) -> bool: ...
+    def set(self, propId: int, value: float, /) -> bool: ...
+    def read(self) -> tuple[bool, Any]: ...
+    def release(self) -> None: ...
 
 
 class Cameras:
@@ -38,7 +49,7 @@ class Cameras:
         self._rig = rig
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._open: dict[int, cv2.VideoCapture] = {}
+        self._open: dict[int, _Capture] = {}
         try:
             for name, address in addresses.items():
                 view = rig.names.index(name)
@@ -88,12 +99,12 @@ class Cameras:
         shots.end(view)
 
 
-def _opened(name: str, address: str, size_wh: tuple[int, int]) -> cv2.VideoCapture:
+def _opened(name: str, address: str, size_wh: tuple[int, int]) -> _Capture:
     """Open a camera, see to its size, and take a first picture."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         if address.isdecimal():
-            capture = cv2.VideoCapture(int(address))
+            capture: _Capture = cv2.VideoCapture(int(address))
         else:
             timeouts = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
             options = [value for timeout in timeouts for value in (timeout, _TIMEOUT_MS)]

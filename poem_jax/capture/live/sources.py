@@ -68,7 +68,7 @@ def _addresses(texts: Sequence[str], rig: Rig) -> dict[str, str]:
         addresses[camera] = what
     if len(addresses) < 2:
         raise ValueError(
-            f"--source must give two cameras of {', '.join(rig.names)} or more: got {len(addresses)}"
+            f"--source must give two cameras of {', '.join(rig.names)} or more; got {len(addresses)}"
         )
     if len(set(addresses.values())) < len(addresses):
         raise ValueError("--source gives two cameras the same source: each has its own")

@@ -8,7 +8,6 @@ from poem_jax.capture.live.engines import LiveEngine
 from poem_jax.capture.live.newest import NewestShots, Shot
 from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
-from poem_jax.geometry.triangulation import triangulate
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
@@ -91,10 +90,19 @@ def seen_hands(view, joints, sides=SIDES):
 
 
 def triangulated(frame):
-    """The joints of a frame's hands by its key points; None = fewer than two views."""
+    """The joints of a frame's hands by its key points (DLT); None = fewer than two views."""
     keypoints = ideal_keypoints(RIG, frame.keypoints_px[None])[0]
-    found = [triangulate(hand, RIG.K, RIG.T_cam_from_world) for hand in keypoints]
-    return [joints if valid.all() else None for joints, valid in found]
+    P = RIG.K @ RIG.T_cam_from_world[:, :3]
+    found = []
+    for hand in keypoints:
+        seen = np.isfinite(hand).all((-1, -2))
+        rows = hand[seen, :, :, None] * P[seen, None, 2:] - P[seen, None, :2]
+        if seen.sum() < 2:
+            found.append(None)
+            continue
+        solution = np.linalg.svd(np.moveaxis(rows, 0, 1).reshape(21, -1, 4))[2][:, -1]
+        found.append(solution[:, :3] / solution[:, 3:])
+    return found
 
 
 def fake_engine(shots=None, work_s=0.0):

@@ -91,9 +91,7 @@ def test_a_client_that_leaves_ends_nothing(caplog):
 def test_a_port_in_use_is_one_clear_error():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        with pytest.raises(
-            ValueError, match=rf"port {port} of 127.0.0.1 cannot be used .* another --websocket"
-        ):
+        with pytest.raises(ValueError, match=rf"port {port} of 127.0.0.1 .* another --websocket"):
             WebsocketStream("127.0.0.1", port)
     with pytest.raises(ValueError, match="--viewer must be a port from 1 to 65535; got 70000"):
         check_port_is_free("127.0.0.1", 70000, "--viewer")
@@ -101,7 +99,7 @@ def test_a_port_in_use_is_one_clear_error():
 
 @pytest.mark.parametrize("text", ["9000", "host:", ":9000", "host:x", "host:0", "host:65536"])
 def test_receivers_that_are_none(text):
-    with pytest.raises(ValueError, match=r"--udp must be HOST:PORT, as 127\.0\.0\.1:9000"):
+    with pytest.raises(ValueError, match="--udp must be HOST:PORT"):
         parse_receiver(text)
 
 
