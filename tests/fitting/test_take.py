@@ -436,8 +436,12 @@ def test_released_key_points(shared_dir):
     assert fitted < dlt
 
 
+WANDERING = SmoothConfig(sigma_angle=0.2, sigma_m=0.02)
+"""No step of the first pass is longer by more than its noise: the walk at rest holds them all."""
+
+
 def at_times(model, take, mask, time_s):
-    return fit_take(model, weighted(take, mask), config=FitConfig(smooth=AT_REST), time_s=time_s)
+    return fit_take(model, weighted(take, mask), config=FitConfig(smooth=WANDERING), time_s=time_s)
 
 
 @pytest.mark.slow
@@ -455,10 +459,13 @@ def test_the_walk_grows_with_the_time_between_frames(model, takes):
     kept = take._replace(uv_px=take.uv_px[order])
     times = np.concatenate([every[::2], every[-1] + np.arange(1, 1 + half) / 30])
     left_out = at_times(model, kept, mask, times)
-    away = 1000 * np.linalg.norm(left_out.joints[:half] - unseen.joints[::2], axis=-1)
-    assert away.mean() < 0.1
-    wrong = at_times(model, kept, mask, times / 1000)
-    assert 1000 * np.linalg.norm(wrong.joints[:half] - unseen.joints[::2], axis=-1).mean() > 5 * away.mean()
+
+    def away_mm(result):
+        return 1000 * np.linalg.norm(result.joints[:half] - unseen.joints[::2], axis=-1).mean()
+
+    assert away_mm(left_out) < 0.01
+    assert away_mm(at_times(model, kept, mask, None)) > 0.05, "as if no time had been left out"
+    assert away_mm(at_times(model, kept, mask, times / 1000)) > 0.5
     whole = at_times(model, take, np.ones_like(mask), every)
     near = np.linalg.norm(whole.joints[::2] - left_out.joints[:half], axis=-1)
     assert (near < 3 * whole.sigma_m[::2]).mean() > 0.95, "what was left out would have changed little"
