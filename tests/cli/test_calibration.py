@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from poem_jax.calibration.rig_json import read_rig, write_rig
-from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
+from poem_jax.capture import detect
+from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, read_boxes, write_boxes
 from poem_jax.cli.run import main, parse
 from tests.calibration.planted_faults import FAULTS
 from tests.calibration.test_linter import moving_take
@@ -72,6 +73,24 @@ def test_images_are_drawn_on(files, tmp_path):
     drawn = cv2.imread(str(out / f"0000_{rig.names[1]}.jpg"))
     assert drawn.shape == (720, 1280, 3)
     assert drawn.any()
+
+
+def test_images_alone_are_searched_first_and_an_unreadable_one_is_told(files, tmp_path, monkeypatch, caplog):
+    folder, rig = files
+    hands = read_boxes(folder / "keypoints.npz")
+    names = tuple(f"{frame:04d}" for frame in range(len(hands.boxes_px)))
+    monkeypatch.setattr(detect, "detect_hands", lambda frames, *_, **__: hands._replace(frames=names))
+    captured, out = tmp_path / "capture", tmp_path / "out"
+    for name in names:
+        (captured / "frames" / name).mkdir(parents=True)
+    for name in rig.names:
+        cv2.imwrite(str(captured / "frames" / "0000" / f"{name}.png"), np.zeros((720, 1280, 3), np.uint8))
+    (captured / "frames" / "0000" / f"{rig.names[0]}.png").write_bytes(b"no picture")
+    assert poem("check", folder / "rig.json", "--images", captured, "--out", out) == 0
+    assert "0000 is not drawn on" in caplog.text
+    assert json.loads((out / "report.json").read_text())["frames"] == len(names)
+    assert (out / f"0000_{rig.names[1]}.jpg").exists()
+    assert poem("check", folder / "rig.json", "--images", captured) == 2
 
 
 def test_a_touched_rig_is_refined_and_a_good_one_is_not(files, tmp_path, capsys):
