@@ -1,5 +1,7 @@
 """Hands as they move, among the cameras with their pictures: a scene that viser serves to browsers."""
 
+import contextlib
+import io
 import time
 from collections.abc import Mapping, Sequence
 
@@ -35,7 +37,8 @@ class LiveScene:
             faces: Triangles by side.
             host, port: Where to listen; the port must be free.
         """
-        self._server = viser.ViserServer(host, port, label="poem live", verbose=False)
+        with _quiet():
+            self._server = viser.ViserServer(host, port, label="poem live", verbose=False)
         self._cameras, self._faces = cameras, faces
         self._numbers = self._server.gui.add_markdown("waiting for the first moment")
         self._meshes: dict[str, viser.MeshHandle] = {}
@@ -81,7 +84,8 @@ class LiveScene:
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.stop()
+        with _quiet():
+            self._server.stop()
 
     def _frustum(self, camera: PageCamera) -> viser.CameraFrustumHandle:
         T_world_from_cam = invert_rigid(np.asarray(camera.T_cam_from_world, np.float64))
@@ -112,3 +116,8 @@ class LiveScene:
         for client in self._server.get_clients().values():
             camera = client.camera
             camera.position, camera.look_at, camera.up_direction = view.position, view.look_at, view.up
+
+
+def _quiet() -> contextlib.AbstractContextManager:
+    """Keep viser from printing what the command says itself."""
+    return contextlib.redirect_stdout(io.StringIO())
