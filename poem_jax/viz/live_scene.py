@@ -17,7 +17,7 @@ from poem_jax.viz.page_content import HAND_RGB, PageCamera
 _PICTURES_S = 0.2
 """Pictures are renewed so often at most: they take most of the way to the browser."""
 _JPEG_QUALITY = 70
-_FRUSTUM_M = 0.12
+_FRUSTUM_M, _LINE_M = 0.12, 0.002
 
 
 class LiveScene:
@@ -95,6 +95,7 @@ class LiveScene:
             fov=float(2 * np.arctan2(height / 2, camera.focal_px)),
             aspect=width / height,
             scale=_FRUSTUM_M,
+            thickness=_LINE_M,
             image=np.full((height, width, 3), 60, np.uint8),
             format="jpeg",
             jpeg_quality=_JPEG_QUALITY,
