@@ -1,5 +1,7 @@
 """Hands as they move, among the cameras with their pictures: a scene that viser serves to browsers."""
 
+import contextlib
+import io
 import time
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +17,7 @@ from poem_jax.viz.page_content import HAND_RGB, PageCamera
 _PICTURES_S = 0.2
 """Pictures are renewed so often at most: they take most of the way to the browser."""
 _JPEG_QUALITY = 70
-_FRUSTUM_M = 0.12
+_FRUSTUM_M, _LINE_M = 0.12, 0.002
 
 
 class LiveScene:
@@ -35,7 +37,8 @@ class LiveScene:
             faces: Triangles by side.
             host, port: Where to listen; the port must be free.
         """
-        self._server = viser.ViserServer(host, port, label="poem live", verbose=False)
+        with _quiet():
+            self._server = viser.ViserServer(host, port, label="poem live", verbose=False)
         self._cameras, self._faces = cameras, faces
         self._numbers = self._server.gui.add_markdown("waiting for the first moment")
         self._meshes: dict[str, viser.MeshHandle] = {}
@@ -81,7 +84,8 @@ class LiveScene:
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.stop()
+        with _quiet():
+            self._server.stop()
 
     def _frustum(self, camera: PageCamera) -> viser.CameraFrustumHandle:
         T_world_from_cam = invert_rigid(np.asarray(camera.T_cam_from_world, np.float64))
@@ -91,6 +95,7 @@ class LiveScene:
             fov=float(2 * np.arctan2(height / 2, camera.focal_px)),
             aspect=width / height,
             scale=_FRUSTUM_M,
+            thickness=_LINE_M,
             image=np.full((height, width, 3), 60, np.uint8),
             format="jpeg",
             jpeg_quality=_JPEG_QUALITY,
@@ -112,3 +117,8 @@ class LiveScene:
         for client in self._server.get_clients().values():
             camera = client.camera
             camera.position, camera.look_at, camera.up_direction = view.position, view.look_at, view.up
+
+
+def _quiet() -> contextlib.AbstractContextManager:
+    """Keep viser from printing what the command says itself."""
+    return contextlib.redirect_stdout(io.StringIO())

@@ -104,7 +104,7 @@ class WebsocketStream:
         self._thread.join(_CLOSE_S)
 
     def _serve(self, client: ServerConnection) -> None:
-        sent = self._count
+        sent = 0
         # Who has left is no longer served.
         with contextlib.suppress(ConnectionClosed):
             while True:

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from poem_jax.capture.live import finding
 from poem_jax.capture.live.line import run_line
 from poem_jax.capture.live.moments import Moment
 from poem_jax.capture.live.pace import Pace
@@ -34,7 +35,7 @@ class Kept:
         self.at_s.append(self._shots.now)
 
 
-def run(num_frames=12, detect_s=0.0, fit_s=0.0, smoothing=AS_SEEN, views=range(4)):
+def run(num_frames=8, detect_s=0.0, fit_s=0.0, smoothing=AS_SEEN, views=range(4)):
     shots = FakeShots()
     for view in views:
         shots.plan(view, range(num_frames))
@@ -46,8 +47,8 @@ def run(num_frames=12, detect_s=0.0, fit_s=0.0, smoothing=AS_SEEN, views=range(4
 
 def test_the_stream_holds_the_hands_of_its_moments():
     _, pace, kept, _, frames = run()
-    assert [message["moment"] for message in kept.messages] == list(range(12))
-    assert len(frames) == 12
+    assert [message["moment"] for message in kept.messages] == list(range(8))
+    assert len(frames) == 8
     for message in kept.messages:
         assert message["time_s"] == pytest.approx(message["moment"] * PERIOD_S, abs=1e-3)
         truth = true_joints(message["moment"] * PERIOD_S)
@@ -58,12 +59,12 @@ def test_the_stream_holds_the_hands_of_its_moments():
             np.testing.assert_allclose(hand["joints_world"], joints, atol=2e-5)
             assert hand["sigma_m"] == [0.001] * 21
     figures = pace.figures()
-    assert (figures.offered, figures.done, figures.dropped) == (12, 12, 0)
+    assert (figures.offered, figures.done, figures.dropped) == (8, 8, 0)
 
 
 def test_a_slow_detector_gets_the_newest_and_drops_are_counted():
     detect_s, fit_s = 2.4 * PERIOD_S, 0.3 * PERIOD_S
-    shots, pace, kept, asked, _ = run(60, detect_s, fit_s)
+    shots, pace, kept, asked, _ = run(30, detect_s, fit_s)
     for at_s, seen in asked:
         newest = int((at_s - shots.begin_s + 1e-9) / PERIOD_S)
         assert set(seen.values()) == {newest}
@@ -84,33 +85,34 @@ def test_a_slow_detector_gets_the_newest_and_drops_are_counted():
 def test_the_filter_looks_back_only_and_bridges():
     """The first half of a run is the same whatever follows; hands that vanish stay a moment, marked."""
     smoothing = Smoothing("causal", 0.1)
-    _, _, whole, _, _ = run(10, smoothing=smoothing)
-    _, _, part, _, _ = run(5, smoothing=smoothing)
-    assert whole.messages[:5] == part.messages
+    _, _, whole, _, _ = run(7, smoothing=smoothing)
+    _, _, part, _, _ = run(4, smoothing=smoothing)
+    assert whole.messages[:4] == part.messages
     shots = FakeShots()
     for view in range(4):
-        shots.plan(view, range(6) if view else range(14))
+        shots.plan(view, range(3) if view else range(8))
     kept = Kept(shots)
     pace = Pace(shots.clock, shots.begin_s)
     list(run_line(shots, RIG, planted_detector(shots), fake_engine(), smoothing, [kept.send], pace))
     hands = [message["hands"]["left"] for message in kept.messages]
-    assert [hand["bridged"] for hand in hands] == [False] * 6 + [True] * 3 + [False] * (len(hands) - 9)
-    assert [hand["valid"] for hand in hands] == [True] * 9 + [False] * (len(hands) - 9)
-    assert hands[7]["joints_world"] == hands[5]["joints_world"]
-    assert hands[7]["sigma_m"] is None
+    assert [hand["bridged"] for hand in hands] == [False] * 3 + [True] * 3 + [False] * (len(hands) - 6)
+    assert [hand["valid"] for hand in hands] == [True] * 6 + [False] * (len(hands) - 6)
+    assert hands[4]["joints_world"] == hands[2]["joints_world"]
+    assert hands[4]["sigma_m"] is None
     assert hands[-1] == {"valid": False, "bridged": False, "joints_world": None, "sigma_m": None}
 
 
 def test_one_camera_places_no_hand_and_the_line_goes_on():
     _, pace, kept, _, _ = run(views=(2,))
     assert not any(hand["valid"] for message in kept.messages for hand in message["hands"].values())
-    assert pace.figures().done == 12
+    assert pace.figures().done == 8
 
 
-def test_hands_on_which_no_two_cameras_agree_are_told_once(caplog):
+def test_hands_on_which_no_two_cameras_agree_are_told_once(caplog, monkeypatch):
+    monkeypatch.setattr(finding, "_MANY", 3)
     shots = FakeShots()
     for view in range(4):
-        shots.plan(view, range(32))
+        shots.plan(view, range(6))
     pace = Pace(shots.clock, shots.begin_s)
 
     def detect(views, images):
