@@ -13,7 +13,7 @@ PYTEST := $(BIN)/python -m pytest -n 2
 
 help:
 	@echo "make setup   build .venv from the locked versions"
-	@echo "make demo    reconstruct the bundled 4-camera capture into out/demo"
+	@echo "make demo    reconstruct both hands of the four bundled videos into out/demo"
 	@echo "make test    the default test suite (a quarter to half an hour on 2 cores)"
 	@echo "make lint    ruff and pyright"
 	@echo "make bench   print the speed tables of benchmarks/"

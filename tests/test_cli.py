@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from poem_jax.capture.demo import demo_folder
 from poem_jax.cli import USAGE_ERROR, main
+from tests.one_hand.capture import one_hand_folder
 
 
 @pytest.fixture(autouse=True)
@@ -27,24 +27,19 @@ def checkpoint(tmp_path_factory, micro_model):
     return path
 
 
-def test_demo(tmp_path, capsys, checkpoint):
-    out = tmp_path / "demo"
-    assert main(["demo", "--out", str(out), "--checkpoint", str(checkpoint)]) == 0
-    printed = capsys.readouterr().out
-    assert "MPVPE" in printed
-    assert "mm against the ground truth" in printed
-    files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-    overlays = {f"0000/overlay_cam_{view}.png" for view in range(4)}
-    rest = {"0000/right.glb", "0000/right.obj", "prediction.npz", "report.json", "index.html"}
-    assert files == overlays | rest
-    for file in files:
-        assert file.split("/")[-1] in printed
-
-
 def test_reconstruct(tmp_path, capsys, checkpoint):
     out = tmp_path / "out"
-    rig, boxes = demo_folder() / "rig.json", demo_folder() / "boxes.npz"
-    command = ["reconstruct", str(demo_folder()), "--rig", str(rig), "--boxes", str(boxes), "--out", str(out)]
+    rig, boxes = one_hand_folder() / "rig.json", one_hand_folder() / "boxes.npz"
+    command = [
+        "reconstruct",
+        str(one_hand_folder()),
+        "--rig",
+        str(rig),
+        "--boxes",
+        str(boxes),
+        "--out",
+        str(out),
+    ]
     assert main([*command, "--checkpoint", str(checkpoint)]) == 0
     assert "1 of 1 hands in 1 frames" in capsys.readouterr().out
     with np.load(out / "prediction.npz") as arrays:
@@ -60,7 +55,7 @@ def test_reconstruct(tmp_path, capsys, checkpoint):
 )
 def test_an_empty_option_is_not_the_folder_that_one_is_in(tmp_path, monkeypatch, capsys, empty, what):
     monkeypatch.chdir(tmp_path)
-    assert main(["reconstruct", str(demo_folder()), *empty]) == USAGE_ERROR
+    assert main(["reconstruct", str(one_hand_folder()), *empty]) == USAGE_ERROR
     assert capsys.readouterr().err == f"poem: error: {what}: is a shell variable unset?\n"
     assert not list(tmp_path.iterdir())
 
@@ -79,14 +74,14 @@ def test_wrong_input_is_one_line_and_code_2(tmp_path, capsys, checkpoint):
     assert not (tmp_path / "out").exists()
     with pytest.raises(FileNotFoundError, match="no capture folder"):
         main([*command, "--debug"])
-    demo = ["demo", "--out", str(tmp_path / "out"), "--checkpoint", str(tmp_path / "none")]
-    assert main(demo) == USAGE_ERROR
+    no_model = ["reconstruct", str(one_hand_folder()), "--out", str(tmp_path / "out"), "--checkpoint"]
+    assert main([*no_model, str(tmp_path / "none")]) == USAGE_ERROR
     assert "no checkpoint at" in capsys.readouterr().err
 
 
-def test_an_error_of_the_system_is_one_line_too(tmp_path, capsys, checkpoint):
+def test_an_error_of_the_system_is_one_line_too(tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    command = ["demo", "--checkpoint", str(checkpoint), "--out"]
+    command = ["demo", "--out"]
     assert main([*command, str(tmp_path / "file")]) == USAGE_ERROR
     assert "the results go to a folder" in capsys.readouterr().err
     assert main([*command, str(tmp_path / ("x" * 300))]) == USAGE_ERROR

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import MultiViewBatch
-from poem_jax.capture.demo import demo_folder
 from poem_jax.capture.frame import Frame, HandCrops, HandResult
 from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.network import make_network, predict_hands
@@ -42,6 +41,7 @@ from poem_jax.weights.store import load, save
 from poem_jax.weights.torch_import import convert, export_state_dict
 from tests import stand_in
 from tests.micro import MICRO
+from tests.one_hand.capture import one_hand_folder
 from tests.stand_in import StandInConfig
 
 CONFIG = StandInConfig()
@@ -275,7 +275,7 @@ def test_another_number_of_cameras_is_said_before_hands_are_looked_for(tmp_path)
     config = StandInConfig(views=8)
     save(tmp_path / "model", config, params_of(config))
     take = tmp_path / "take"
-    shutil.copytree(demo_folder(), take, ignore=shutil.ignore_patterns("*.npz"))
+    shutil.copytree(one_hand_folder(), take, ignore=shutil.ignore_patterns("*.npz"))
     command = Reconstruct(take, tmp_path / "out", checkpoint=tmp_path / "model")
     with pytest.raises(ValueError, match=r"the rig must have 8 cameras, .* got 4"):
         command.run()

@@ -68,7 +68,10 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     np.savez(boxes, keypoints_px=keypoints, hand_side=SIDES, frames=frames)
     written = reconstruct(
-        read_take(arguments.folder, boxes=boxes), arguments.out, checkpoint=arguments.checkpoint
+        read_take(arguments.folder, boxes=boxes),
+        arguments.out,
+        engine="poem",
+        checkpoint=arguments.checkpoint,
     )
     arrays, table = written.arrays, {}
     for hand, side in [*enumerate(SIDES), (slice(None), "both")]:

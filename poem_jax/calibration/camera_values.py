@@ -5,36 +5,17 @@ that a message begins with. A value whose meaning can be guessed but not known, 
 of a matrix, is refused with what to do; one that has a single meaning, as `t` as a column, is read.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from poem_jax.geometry.camera_checks import ROTATION_TOLERANCE, has_form_of_intrinsics, rotation_error
 from poem_jax.typing import Array, Float
 
 MAX_SIDE = 100_000
 """Pixels. No image is wider or higher."""
-
-DISTORTION_KEYS = (
-    "dist", "distortion", "distortions", "distCoef", "distCoeffs", "dist_coef", "dist_coeffs",
-    "distortion_coefficients", "D",
-)  # fmt: skip
-"""Names under which calibration tools write the terms of `geometry.distortion`, in OpenCV's order."""
-
-_LENS_WORDS = (
-    "dist", "lens", "fisheye", "radial", "tangential", "coef", "equidistant", "omni", "kannala", "brandt",
-    "model", "projection", "rational", "prism", "undistort",
-)  # fmt: skip
-_LENS_TERMS = {
-    "xi",
-    *(f"{letter}{i}" for letter, count in (("k", 6), ("p", 2), ("s", 4)) for i in range(count + 1)),
-}
-_PINHOLE = {
-    "pinhole", "perspective", "opencv", "brown", "radtan", "plumb_bob", "brownconrady", "brown_conrady",
-    "rational_polynomial", "standard", "full_opencv",
-}  # fmt: skip
-"""What the key of a lens model may say: those whose terms are the ones of `geometry.distortion`."""
 
 
 def numbers(value: Any, shape: tuple[int, ...], where: str) -> Array:
@@ -59,6 +40,18 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> Array:
     return array
 
 
+def text(value: Any, where: str) -> str:
+    """Return text; a whole number, as tools name cameras too, becomes its digits."""
+    if isinstance(value, str) or (isinstance(value, int) and not isinstance(value, bool)):
+        return str(value)
+    raise ValueError(f"{where} must be text; got {short(value)}")
+
+
+def number(value: Any, where: str) -> float:
+    """Return a finite real number."""
+    return float(numbers([value], (1,), where)[0])
+
+
 def image_size(width: Any, height: Any, where: str) -> tuple[int, int]:
     """Return width and height as whole pixels; 1280.0 is 1280."""
     if not all(_is_whole(side) and 0 < side <= MAX_SIDE for side in (width, height)):
@@ -67,6 +60,12 @@ def image_size(width: Any, height: Any, where: str) -> tuple[int, int]:
             f"{short(height)}"
         )
     return int(width), int(height)
+
+
+def image_size_of(sides: Sequence[Any], where: str) -> tuple[int, int]:
+    """Return a list of width and height as whole pixels."""
+    width, height = sides
+    return image_size(width, height, where)
 
 
 def intrinsics(value: Any, where: str) -> Float[Array, "3 3"]:
@@ -123,6 +122,23 @@ def rotation(value: Any, where: str) -> Float[Array, "3 3"]:
     return R
 
 
+def rotation_or_vector(value: Any, where: str) -> Float[Array, "3 3"]:
+    """Return R from a rotation matrix, or from a rotation vector (axis times angle, radians)."""
+    if _shape(value) in ((3,), (3, 1), (1, 3)):
+        return rotation_of_vector(numbers(value, (3,), f"{where}: the rotation vector"))
+    return rotation(value, where)
+
+
+def rotation_of_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Return the matrix of a rotation vector, as `cv2.Rodrigues` in both directions, in double precision."""
+    return Rotation.from_rotvec(np.asarray(vector, np.float64)).as_matrix()
+
+
+def vector_of_rotation(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Return the rotation vector of a matrix."""
+    return Rotation.from_matrix(R).as_rotvec()
+
+
 def translation(value: Any, where: str) -> Float[Array, "3"]:
     """Return t in the file's unit; a row or a column serves."""
     hint = ""
@@ -135,74 +151,23 @@ def translation(value: Any, where: str) -> Float[Array, "3"]:
     return numbers(value, (3,), f"{where}: `t`")
 
 
-def distortion(camera: Mapping[str, Any], where: str) -> Float[Array, " term"]:
-    """Return the 5 or 8 terms of `geometry.distortion`, whichever of `DISTORTION_KEYS` they stand under.
+def entry(content: Any, key: str, where: str) -> Any:
+    """Return the value under a key of a map.
 
-    Raises:
-        ValueError: the terms stand twice and differ, are too many, or belong to another model of the lens.
+    Raises: ValueError: there is no such key, or no map.
     """
-    check_lens_keys(camera, where)
-    found = {key: _terms(camera[key], key, where) for key in DISTORTION_KEYS if camera.get(key) is not None}
-    if not found:
-        return np.zeros(5)
-    key = next(iter(found))
-    for other, terms in found.items():
-        if not np.array_equal(terms, found[key]):
-            raise ValueError(f"{where}: `{key}` and `{other}` both give the lens, and differ; keep one")
-    return found[key]
-
-
-def check_lens_keys(content: Mapping[str, Any], where: str) -> None:
-    """Refuse keys that say something of the lens which is not read: another name, model or layout.
-
-    Raises: ValueError: such a key holds anything but nothing (null, false, zeros, an empty list).
-    """
-    for key, value in content.items():
-        name = str(key).lower()
-        if key in DISTORTION_KEYS or not (name in _LENS_TERMS or any(word in name for word in _LENS_WORDS)):
-            continue
-        if _says_nothing(value) or str(value).strip().lower().replace("-", "_") in _PINHOLE:
-            continue
-        raise ValueError(
-            f"{where}: `{key}` says something of the lens that is not read, {short(value)}; write the terms "
-            "k1 k2 p1 p2 k3 (k4 k5 k6) of OpenCV's pinhole model as `dist`; images of other lenses (fisheye) "
-            "must be undistorted first"
-        )
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{where} must hold `{key}` and others by name; got {short(content)}")
+    if key not in content:
+        found = ", ".join(str(name)[:40] for name in list(content)[:20]) or "nothing"
+        raise ValueError(f"{where}: `{key}` is missing; found {found}")
+    return content[key]
 
 
 def short(value: Any) -> str:
     """Return a value as a message shows it."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _terms(value: Any, key: str, where: str) -> Float[Array, " term"]:
-    """Return 5 terms where k4, k5 and k6 are zero, else 8."""
-    if isinstance(value, Mapping):
-        raise ValueError(f"{where}: `{key}` must be a list k1 k2 p1 p2 k3; got {short(value)}")
-    try:
-        count = int(np.size(value))
-    except ValueError:
-        count = -1
-    terms = numbers(value, (count,), f"{where}: `{key}`") if count else np.zeros(0)
-    if count not in (0, 4, 5, 8, 12, 14) or terms[8:].any():
-        more = "" if count <= 8 else " (thin prisms and tilted sensors are not modelled)"
-        raise ValueError(
-            f"{where}: `{key}` must hold 4, 5 or 8 terms, k1 k2 p1 p2 k3 k4 k5 k6{more}; got {count}: "
-            f"{short(terms.tolist())}"
-        )
-    terms = np.concatenate([terms[:8], np.zeros(max(0, 8 - count))])
-    return terms if terms[5:].any() else terms[:5]
-
-
-def _says_nothing(value: Any) -> bool:
-    """Tell null, false, empty and all-zero values."""
-    if value is None or value is False or (isinstance(value, str | list | dict) and not value):
-        return True
-    try:
-        return not np.array(value, np.float64).any()
-    except (TypeError, ValueError, OverflowError):
-        return False
 
 
 def _is_whole(value: Any) -> bool:

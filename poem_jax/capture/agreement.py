@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from poem_jax.calibration.lens_reach import beyond_the_lens
 from poem_jax.capture.crop import hand_squares
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.capture.take import in_groups
@@ -38,20 +39,25 @@ def judge_boxes(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
         frames: A stream, without images so far.
         rig: The cameras.
 
-    Returns: the stream, with `squares_px`, and `hands` that hold a reason where there is one.
+    Returns: the stream, with `squares_px`, and `hands` that hold a reason where there is one; and a warning
+        at the first frame of which a lens does not show what its boxes hold.
 
     Raises:
         ValueError: A camera is wrong by itself, the cameras are too far apart, or most hands' views do not
             meet in the first frames. The message says what, expected, got and fix.
     """
     check_each_camera(rig)
+    said = False
     for index, group in enumerate(in_groups(frames, _WINDOW)):
         squares = np.stack([hand_squares(frame, rig) for frame in group])
         reasons = iter(_reasons_against(squares.reshape(-1, rig.num_views, 4), rig, refuse=index == 0))
         unused = np.zeros(rig.num_views, bool)
         for frame, squares_px in zip(group, squares, strict=True):
             hands = tuple(HandResult(unused, next(reasons)) for _ in squares_px)
-            yield frame._replace(squares_px=squares_px, hands=hands)
+            lost = np.isfinite(frame.boxes_px).all(-1) & ~np.isfinite(squares_px).all(-1)
+            warnings = [] if said else beyond_the_lens(rig, lost.sum(0), "hands")
+            said = said or bool(warnings)
+            yield frame._replace(squares_px=squares_px, hands=hands, warnings=(*frame.warnings, *warnings))
 
 
 def _reasons_against(

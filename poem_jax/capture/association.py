@@ -15,7 +15,7 @@ from poem_jax.capture.hand_choice import SIDES, kept_tracks, name_sides, trusted
 from poem_jax.capture.hand_matching import match_views
 from poem_jax.capture.hand_tracks import Track, follow_hands
 from poem_jax.capture.lone_detections import join_lone_detections
-from poem_jax.capture.sightings import NONE, Sightings, sightings_of_frames, vote_for_right
+from poem_jax.capture.sightings import NONE, Sightings, SightingsOfFrames, vote_for_right
 from poem_jax.data.capture_folder import hand_names
 from poem_jax.detection import DetectedHand
 from poem_jax.geometry.rig import Rig
@@ -71,8 +71,8 @@ def associate_hands(
     if len(seeing) == 1:
         return _by_side_alone(detections, rig, seeing.pop(), max_hands, called)
     near = move_origin(rig.T_cam_from_world, distant_origin(rig.T_cam_from_world))
-    frames = sightings_of_frames(detections, rig._replace(T_cam_from_world=near))
-    followed = follow_hands([match_views(frame, max_hands) for frame in frames])
+    frames = SightingsOfFrames(detections, rig._replace(T_cam_from_world=near))
+    followed = follow_hands(match_views(frame, max_hands) for frame in frames)
     if not followed.tracks:
         raise ValueError(
             f"no two of the cameras {', '.join(rig.names)} agree on a hand in any frame, though hands were "
@@ -127,12 +127,11 @@ def _table(tracks: Sequence[Track], num_frames: int, num_views: int) -> _Found:
 
 def _votes(frames: Sequence[Sightings], found: _Found) -> list[Float[Array, " _"]]:
     """Return the votes of all detections of every hand."""
-    return [
-        np.concatenate(
-            [frame.votes[row[row != NONE]] for frame, row in zip(frames, hand, strict=True)] or [np.zeros(0)]
-        )
-        for hand in found
-    ]
+    votes: list[list[Array]] = [[np.zeros(0)] for _ in found]
+    for number, frame in enumerate(frames):
+        for of_hand, row in zip(votes, found[:, number], strict=True):
+            of_hand.append(frame.votes[row[row != NONE]])
+    return [np.concatenate(of_hand) for of_hand in votes]
 
 
 def _entries(
@@ -142,9 +141,10 @@ def _entries(
     num_hands, num_frames, num_views = found.shape
     keypoints = np.full((num_frames, num_hands, num_views, NUM_JOINTS, 2), np.nan)
     scores = np.full((num_frames, num_hands, num_views), np.nan)
-    for hand, frame, view in np.argwhere(found != NONE):
-        chosen = detections[frame][view][frames[frame].number[found[hand, frame, view]]]
-        keypoints[frame, hand, view], scores[frame, hand, view] = chosen.keypoints_px, chosen.score
+    for frame, (views, sightings) in enumerate(zip(detections, frames, strict=True)):
+        for hand, view in np.argwhere(found[:, frame] != NONE):
+            chosen = views[view][sightings.number[found[hand, frame, view]]]
+            keypoints[frame, hand, view], scores[frame, hand, view] = chosen.keypoints_px, chosen.score
     return keypoints, scores
 
 

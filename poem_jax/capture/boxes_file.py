@@ -7,12 +7,12 @@ kinds of npz are read:
     key points  `keypoints_px (F, H, V, 21, 2)` OpenPose order, NaN = unseen; `hand_side (H,)`
 
 both in pixels of the raw (distorted) images, both with an optional `frames (F,)` of names or numbers and an
-optional `cameras (V,)` of names, by which views in another order than the rig's are matched. Key points may
-have a `confidence (F, H, V, 21)` from 0 to 1, NaN = unseen: those below `MIN_CONFIDENCE` count as unseen, and
-so do those at exactly (0, 0) or (-1, -1), where detectors put what they do not find. Key points count pixels
-from the centre of the top-left one, as detectors and calibrations do, and are moved by half a pixel here; a
-box gives edges, so that the whole image is 0 0 W H. A text `detector` names what found the key points
-(`fitting.detector_offsets` knows some).
+optional `cameras (V,)` of names, by which views in another order than the rig's are matched, and an optional
+`time_s (F,)`, the seconds since the take began. Key points may have a `confidence (F, H, V, 21)` from 0 to 1,
+NaN = unseen: those below `MIN_CONFIDENCE` count as unseen, and so do those at exactly (0, 0) or (-1, -1),
+where detectors put what they do not find. Key points count pixels from the centre of the top-left one, as
+detectors and calibrations do, and are moved by half a pixel here; a box gives edges, so that the whole image
+is 0 0 W H. A text `detector` names what found the key points (`fitting.detector_offsets` knows some).
 """
 
 import logging
@@ -23,15 +23,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from poem_jax.capture.boxes_labels import cameras_of_views, detector_of, frames_of, sides_of, times_of
 from poem_jax.data.capture_folder import frame_key
 from poem_jax.geometry.rig import HALF_PIXEL
 from poem_jax.hand.topology import NUM_JOINTS
 from poem_jax.io.atomic import whole_file
-from poem_jax.io.file_names import name_key, safe_file_names
+from poem_jax.io.file_names import name_key
 from poem_jax.io.npz_file import read_npz
 from poem_jax.typing import Array, Float, Int
 
-SIDES = ("left", "right")
 HOW_TO_GET_BOXES = (
     "say where the hands are: an npz with `boxes_px (F, H, V, 4)` (x0 y0 x1 y1 in the raw images, NaN = "
     "unseen) or `keypoints_px (F, H, V, 21, 2)`, and `hand_side (H,)`; pass it by --boxes or put it beside "
@@ -67,6 +67,8 @@ class HandBoxes(NamedTuple):
     """Names of the views as the file gives them, None where it gives none."""
     detector: str | None = None
     """What found the key points, None where the file does not say."""
+    time_s: Float[Array, " frame"] | None = None
+    """Seconds since the take began, None where the file gives none; NaN in frames that it does not name."""
 
 
 def read_boxes(path: str | os.PathLike) -> HandBoxes:
@@ -82,7 +84,7 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
     if not path.is_file():
         raise FileNotFoundError(f"no boxes file at {path}; {HOW_TO_GET_BOXES}")
     content = read_npz(path)
-    sides = _sides(content, path)
+    sides = sides_of(content, path)
     keypoints = _keypoints(content, len(sides), path)
     boxes = _boxes(content, len(sides), path)
     if boxes is None and keypoints is None:
@@ -94,15 +96,17 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
         boxes = boxes_from_keypoints(keypoints)
     if not len(boxes):
         raise ValueError(f"{path} must hold at least one frame; got none")
-    frames = _frames(content, len(boxes), path)
+    frames = frames_of(content, len(boxes), path)
     if keypoints is not None and keypoints.shape[:3] != boxes.shape[:3]:
         raise ValueError(
             f"{path}: `keypoints_px` and `boxes_px` must agree in frames, hands and views; "
             f"got {keypoints.shape[:3]} and {boxes.shape[:3]}"
         )
     confidence = content.get("confidence") if keypoints is not None else None
-    cameras = _cameras(content, boxes.shape[2], path)
-    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, _detector(content, path))
+    cameras = cameras_of_views(content, boxes.shape[2], path)
+    times = times_of(content, len(boxes), path)
+    detector = detector_of(content, path)
+    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, detector, times)
 
 
 def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
@@ -118,6 +122,8 @@ def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
         content["cameras"] = np.array(boxes.cameras)
     if boxes.detector is not None:
         content["detector"] = np.array(boxes.detector)
+    if boxes.time_s is not None:
+        content["time_s"] = boxes.time_s
     # A stream, since NumPy would add a suffix to a name that has none.
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **content)
@@ -211,24 +217,15 @@ def _take_everywhere(boxes: HandBoxes, rows: Array, axis: int) -> HandBoxes:
         None if array is None else _take(array, rows, axis)
         for array in (boxes.boxes_px, boxes.keypoints_px, boxes.confidence)
     )
-    return boxes._replace(boxes_px=boxes_px, keypoints_px=keypoints_px, confidence=confidence)
+    boxes = boxes._replace(boxes_px=boxes_px, keypoints_px=keypoints_px, confidence=confidence)
+    if axis != 0 or boxes.time_s is None:
+        return boxes
+    return boxes._replace(time_s=_take(boxes.time_s, rows, axis))
 
 
 def _take(array: Array, rows: Array, axis: int) -> Array:
     found = np.expand_dims(rows >= 0, tuple(i for i in range(array.ndim) if i != axis))
     return np.where(found, array.take(rows, axis), np.nan)
-
-
-def _sides(content: Mapping[str, Array], path: Path) -> tuple[str, ...]:
-    if "hand_side" not in content:
-        raise ValueError(f"{path}: `hand_side (H,)` is missing; it says 'left' or 'right' for each hand")
-    sides = tuple(side.strip().lower() for side in _texts(content["hand_side"]))
-    wrong = [side for side in sides if side not in SIDES]
-    if wrong or not sides:
-        raise ValueError(
-            f"{path}: `hand_side` must hold 'left' or 'right'; got {wrong[0] if wrong else 'none'!r}"
-        )
-    return sides
 
 
 def _keypoints(content: Mapping[str, Array], num_hands: int, path: Path) -> Array | None:
@@ -314,41 +311,3 @@ def _layout_hint(shape: tuple[int, ...], tail: tuple[int, ...]) -> str:
     if shape[3:] == tail[1:] and shape[2] == tail[0]:
         return "; views and hands are exchanged: use numpy.swapaxes(..., 1, 2)"
     return ""
-
-
-def _frames(content: Mapping[str, Array], num_frames: int, path: Path) -> tuple[str, ...] | None:
-    if "frames" not in content:
-        return None
-    names = _texts(content["frames"])
-    if len(names) != num_frames:
-        raise ValueError(f"{path}: `frames` must name {num_frames} frames; got {len(names)}")
-    safe_file_names(names, f"{path}: `frames`")
-    if len({frame_key(name) for name in names}) < len(names):
-        raise ValueError(f"{path}: `frames` must differ from each other, also as numbers; got {names[:6]}")
-    return names
-
-
-def _cameras(content: Mapping[str, Array], num_views: int, path: Path) -> tuple[str, ...] | None:
-    if "cameras" not in content:
-        return None
-    names = _texts(content["cameras"])
-    if len(names) != num_views:
-        raise ValueError(f"{path}: `cameras` must name {num_views} views; got {len(names)}")
-    return safe_file_names(names, f"{path}: `cameras`")
-
-
-def _detector(content: Mapping[str, Array], path: Path) -> str | None:
-    if "detector" not in content:
-        return None
-    names = _texts(content["detector"])
-    if len(names) != 1:
-        raise ValueError(f"{path}: `detector` must be one name; got {len(names)}")
-    return names[0].strip() or None
-
-
-def _texts(array: Array) -> tuple[str, ...]:
-    """Return text or numbers as text; whole floats as whole numbers."""
-    values = np.atleast_1d(array).ravel().tolist()
-    if array.dtype.kind == "S":
-        return tuple(value.decode("utf-8", "backslashreplace") for value in values)
-    return tuple(str(int(v)) if isinstance(v, float) and v.is_integer() else str(v) for v in values)

@@ -11,7 +11,7 @@ from poem_jax.calibration.epipolar import epipolar_distances_px, ideal_keypoints
 from poem_jax.calibration.findings import Finding
 from poem_jax.calibration.meeting_points import meeting_points, near_rig
 from poem_jax.capture.calibration_check import check_calibration
-from poem_jax.capture.read import image_of_camera
+from poem_jax.capture.read import read_views
 from poem_jax.capture.take import read_keypoint_take
 from poem_jax.data.capture_folder import FramePaths, find_rig
 from poem_jax.data.lens import project_raw
@@ -163,10 +163,11 @@ def _draw_frames(rig: Rig, hands: Array, joints: Array, footage: _Footage, folde
     chosen = np.unique(np.linspace(0, len(pictured) - 1, min(len(pictured), _PICTURED_FRAMES)).astype(int))
     by_frame = joints.reshape(*hands.shape[:2], *joints.shape[1:])
     for index in (pictured[i] for i in chosen):
-        for view, path in enumerate(footage.images[index].images):
-            if path is None:
+        for view, image in enumerate(read_views(footage.images[index].images, rig)):
+            if isinstance(image, FileNotFoundError | ValueError):
+                raise image
+            if image is None:
                 continue
-            image = image_of_camera(path, rig, view)
             together = np.stack([project_raw(rig, view, hand)[0] for hand in by_frame[index]])
             off = np.linalg.norm(together - hands[index, :, view], axis=-1)
             known = off[np.isfinite(off)]

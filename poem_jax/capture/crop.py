@@ -6,7 +6,7 @@ import numpy as np
 
 from poem_jax.capture.boxes_file import boxes_from_keypoints
 from poem_jax.capture.frame import Frame, HandCrops
-from poem_jax.data.lens import picture_map, take_picture
+from poem_jax.data.lens import ideal_pixels, picture_map, take_picture
 from poem_jax.data.transforms import square_box
 from poem_jax.geometry.cameras import crop_intrinsics, normalised_from_pixels, roll
 from poem_jax.geometry.distortion import undistort_pixels
@@ -23,11 +23,13 @@ def hand_squares(frame: Frame, rig: Rig) -> Float[Array, "hand view 4"]:
     """Return the square about each hand in each view, in pixels without distortion; NaN = unseen.
 
     The hand's extent is that of its key points where they say enough, else that of its box, whose outline is
-    followed through the lens.
+    followed through the lens. Where the lens has no ray for half of it, no flat picture shows the hand, and
+    it counts as unseen.
     """
     squares = np.full(frame.boxes_px.shape, np.nan)
     for hand, view in np.argwhere(np.isfinite(frame.boxes_px).all(-1)):
-        squares[hand, view] = square_box(_extent(frame, rig, int(hand), int(view)), 1.0)
+        points = _extent(frame, rig, int(hand), int(view))
+        squares[hand, view] = np.nan if points is None else square_box(points, 1.0)
     return squares
 
 
@@ -59,14 +61,16 @@ def crop_hands(
         yield frame._replace(crops=tuple(crops))
 
 
-def _extent(frame: Frame, rig: Rig, hand: int, view: int) -> Float[Array, "point 2"]:
-    """Return points about a hand in a view, in pixels without distortion."""
+def _extent(frame: Frame, rig: Rig, hand: int, view: int) -> Float[Array, "point 2"] | None:
+    """Return points about a hand in a view, in pixels without distortion; None = most have none."""
     points = _outline(frame.boxes_px[hand, view])
     if frame.keypoints_px is not None:
         raw = frame.keypoints_px[hand, view]
         if np.isfinite(boxes_from_keypoints(raw)).all():
             points = raw[np.isfinite(raw).all(-1)]
-    return undistort_pixels(points, rig.K[view], rig.dist[view])
+    ideal = ideal_pixels(points, rig.K[view], rig.dist[view])
+    shown = np.isfinite(ideal).all(-1)
+    return ideal[shown] if 2 * shown.sum() > len(shown) else None
 
 
 def _upright_squares(
@@ -87,6 +91,8 @@ def _upright_squares(
         turns[view] = -np.pi / 2 - np.arctan2(up[1], up[0])
         _, H = roll(K, rig.T_cam_from_world[view], turns[view])
         points = _extent(frame, rig, hand, int(view))
+        if points is None:
+            continue
         turned = np.concatenate([points, np.ones_like(points[:, :1])], -1) @ H.T
         squares[view] = square_box(turned[:, :2] / turned[:, 2:], 1.0)
     return squares, turns

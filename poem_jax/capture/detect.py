@@ -4,27 +4,31 @@ Every image is looked at by itself, or a camera's images one after the other as 
 of one hand is then decided for the whole take, by geometry (`association`).
 """
 
+import hashlib
+import json
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from tqdm import tqdm
 
 from poem_jax.capture.association import AssociatedHands, associate_hands
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
-from poem_jax.capture.read import image_of_camera
+from poem_jax.capture.detections import Detections, SearchFile
+from poem_jax.capture.moments import Moments
+from poem_jax.capture.read import ReadView, read_views
+from poem_jax.capture.timing import Timing
 from poem_jax.data.capture_folder import FramePaths
-from poem_jax.detection import DetectedHand, HandTracker, find_hands
+from poem_jax.detection import DetectedHand, HandTrackers, find_hands
 from poem_jax.fitting.detector_offsets import MEDIAPIPE_HANDS
 from poem_jax.geometry.rig import Rig
+from poem_jax.io.reading_ahead import read_ahead
 from poem_jax.typing import Array, Float, UInt8
 
 Detector = Callable[[Sequence[int], Sequence[UInt8[Array, "_ _ 3"]]], Sequence[Sequence[DetectedHand]]]
 """From the numbers of some views and their images of a frame to the hands in each."""
-Found = list[Sequence[DetectedHand]]
-"""The hands in every view of a frame."""
 
-DETECTOR = "mediapipe-hands"
 _MORE_IN_AN_IMAGE = 2
 """Places looked at in an image beyond the hands of the take: faces, and the hands of others."""
 
@@ -38,18 +42,20 @@ def detect_hands(
     max_hands: int = 2,
     video: bool = False,
     detector: Detector | None = None,
+    file: SearchFile | None = None,
     when_stopped: Callable[[HandBoxes], object] | None = None,
     progress: bool = True,
 ) -> HandBoxes:
     """Find the hands in every image of a capture.
 
     Args:
-        frames: From `find_frames`; images that are missing or damaged see nothing (a warning names them).
+        frames: From `find_moments`; images that are missing or damaged see nothing (a warning names them).
         rig: The cameras.
         max_hands: Hands in the take.
         video: A hand is looked for where it was in the frame before: faster where frames follow each other
             closely.
         detector: Finds the hands in some views of a frame; None = `poem_jax.detection`.
+        file: Keeps what was found; frames that it has of the same search are not searched again.
         when_stopped: Called with the hands of the frames that are done, where there are any, when a signal
             stops the search; the `KeyboardInterrupt` then passes on.
         progress: Show a progress bar when there are several frames.
@@ -61,75 +67,113 @@ def detect_hands(
         ValueError: No image can be read, no hand was found, or no two cameras agree on one.
     """
     name = MEDIAPIPE_HANDS if detector is None else None
+    found = Detections(rig.num_views) if file is None else file.take_up(rig.num_views)
     search = _Search(rig, _our_detector(rig.num_views, max_hands, video) if detector is None else detector)
-    found: list[Found] = []
-    try:
-        for paths in tqdm(frames, unit="frame", disable=not progress or len(frames) == 1):
-            found.append(search.look(paths))
-    except KeyboardInterrupt:
-        if when_stopped is not None:
-            _hand_over(found, frames, rig, max_hands, name, when_stopped)
-        raise
-    search.report(found, len(frames))
+    done = min(len(found), len(frames))
+    if done:
+        _log.info("%d of %d frames were searched before, and are not searched again", done, len(frames))
+    rest = (frames[index] for index in range(done, len(frames)))
+    hidden = not progress or len(frames) == 1
+    with tqdm(total=len(frames), initial=done, unit="frame", disable=hidden) as bar:
+        try:
+            for paths, views in read_ahead(rest, partial(_read, rig=rig)):
+                added = found.append(search.look(paths, views))
+                if file is not None:
+                    file.add(added)
+                bar.update()
+        except KeyboardInterrupt:
+            if when_stopped is not None:
+                _hand_over(found, frames, rig, max_hands, name, when_stopped)
+            raise
+        finally:
+            if file is not None:
+                file.close()
+    found = found[: len(frames)]
+    search.report(found)
     return _hand_boxes(found, frames, rig, max_hands, name)
 
 
+def describe_search(moments: Moments, rig: Rig, timing: Timing, *, max_hands: int, video: bool) -> str:
+    """Say in one line what is searched and how: what was found by the same search can be used again.
+
+    Files count as the same where names, sizes and times of their last change are. Where the part of the take
+    ends does not matter: a longer search goes on from a shorter one.
+    """
+    import poem_jax
+
+    files = hashlib.sha256()
+    for path in moments.files():
+        state = path.stat()
+        files.update(f"{path.resolve()} {state.st_size} {state.st_mtime_ns}\n".encode())
+    first = moments.frames[0]
+    content = {
+        "search": "poem detect",
+        "version": poem_jax.__version__,
+        "files": files.hexdigest(),
+        "cameras": list(rig.names),
+        "size_wh": rig.size_wh.tolist(),
+        "begins": [first.name, first.time_s],
+        "every": timing.every,
+        "frames_per_second": moments.frames_per_second,
+        "offsets_s": dict(sorted(timing.offsets_s.items())),
+        "max_hands": max_hands,
+        "video": video,
+    }
+    return json.dumps(content)
+
+
 class _Search:
-    """Goes through the frames, and remembers what is wrong with the cameras' images."""
+    """Looks at the frames, and remembers what is wrong with the cameras' images."""
 
     def __init__(self, rig: Rig, detector: Detector) -> None:
         self._rig, self._detector = rig, detector
-        self._problems: dict[int, list[FileNotFoundError | ValueError]] = {}
-        self._images = np.zeros(rig.num_views, int)
+        self._problems: dict[int, FileNotFoundError | ValueError] = {}
+        """The first of every camera."""
 
-    def look(self, paths: FramePaths) -> Found:
-        """Return the hands in every view of a frame; the first lost image of a camera is told at once."""
+    def look(self, paths: FramePaths, views: Sequence[ReadView]) -> list[Sequence[DetectedHand] | None]:
+        """Return the hands in every view, None without an image; the first lost one is told at once."""
         images = {}
-        for view, path in enumerate(paths.images):
-            try:
-                if path is None:
-                    raise FileNotFoundError(f"there is none of camera '{self._rig.names[view]}'")
-                images[view] = image_of_camera(path, self._rig, view)
-            except (FileNotFoundError, ValueError) as error:
-                problems = self._problems.setdefault(view, [])
-                if not problems:
-                    _log.warning("frame %s: an image is left out: %s", paths.name, error)
-                problems.append(error)
-        self._images[list(images)] += 1
+        for view, image in enumerate(views):
+            if isinstance(image, np.ndarray):
+                images[view] = image
+                continue
+            problem = image or FileNotFoundError(f"there is none of camera '{self._rig.names[view]}'")
+            if view not in self._problems:
+                self._problems[view] = problem
+                _log.warning("frame %s: an image is left out: %s", paths.name, problem)
         hands = self._detector(list(images), list(images.values())) if images else []
         by_view = dict(zip(images, hands, strict=True))
-        return [by_view.get(view, ()) for view in range(self._rig.num_views)]
+        return [by_view.get(view) for view in range(self._rig.num_views)]
 
-    def report(self, found: Sequence[Found], num_frames: int) -> None:
+    def report(self, found: Detections) -> None:
         """Tell which cameras were of no use; raise the first problem where none was of any."""
-        if not self._images.any():
-            raise next(iter(self._problems.values()))[0]
-        for view, problems in self._problems.items():
-            if len(problems) > 1:
-                name = self._rig.names[view]
-                _log.warning(
-                    "camera '%s': %d of %d images are left out in all", name, len(problems), num_frames
-                )
-        if not any(hands for frame in found for hands in frame):
+        looked_at = found.looked_at
+        if not looked_at.any():
+            raise next(iter(self._problems.values()), ValueError("none of the images can be read"))
+        for name, lost in zip(self._rig.names, (~looked_at).sum(0), strict=True):
+            if lost > 1:
+                _log.warning("camera '%s': %d of %d images are left out in all", name, lost, len(found))
+        hands = found.hands_found.sum(0)
+        if not hands.any():
             raise ValueError(
-                f"no hand was found in any image of {num_frames} frames; give boxes or key points instead"
+                f"no hand was found in any image of {len(found)} frames; give boxes or key points instead"
             )
-        for view in np.flatnonzero(self._images):
-            if not any(frame[view] for frame in found):
-                _log.warning("camera '%s' shows no hand in any image: is it covered?", self._rig.names[view])
+        for view in np.flatnonzero(looked_at.any(0) & (hands == 0)):
+            _log.warning("camera '%s' shows no hand in any image: is it covered?", self._rig.names[view])
+
+
+def _read(paths: FramePaths, rig: Rig) -> list[ReadView]:
+    return read_views(paths.images, rig)
 
 
 def _our_detector(num_views: int, max_hands: int, video: bool) -> Detector:
-    if not video:
-        return lambda views, images: find_hands(images, max_hands=max_hands + _MORE_IN_AN_IMAGE)
-    trackers = [HandTracker(max_hands) for _ in range(num_views)]
-    return lambda views, images: [
-        trackers[view].find_hands(image) for view, image in zip(views, images, strict=True)
-    ]
+    if video:
+        return HandTrackers(num_views, max_hands).find_hands
+    return lambda views, images: find_hands(images, max_hands=max_hands + _MORE_IN_AN_IMAGE)
 
 
 def _hand_over(
-    found: list[Found],
+    found: Detections,
     frames: Sequence[FramePaths],
     rig: Rig,
     max_hands: int,
@@ -138,30 +182,34 @@ def _hand_over(
 ) -> None:
     """Pass on what was found so far, if it is enough to tell hands apart."""
     try:
-        hands = _hand_boxes(found, frames[: len(found)], rig, max_hands, detector)
+        hands = _hand_boxes(found, frames, rig, max_hands, detector)
     except ValueError as error:
-        _log.warning("nothing is written of the frames that were searched: %s", error)
+        _log.warning("no key points are written of the frames that were searched: %s", error)
         return
     when_stopped(hands)
 
 
 def _hand_boxes(
-    found: list[Found], frames: Sequence[FramePaths], rig: Rig, max_hands: int, detector: str | None
+    found: Detections, frames: Sequence[FramePaths], rig: Rig, max_hands: int, detector: str | None
 ) -> HandBoxes:
     """Put what `detector` found into one track a hand."""
-    names = tuple(frame.name for frame in frames)
+    searched = [frames[index] for index in range(len(found))]
+    names, times = tuple(frame.name for frame in searched), [frame.time_s for frame in searched]
     hands = associate_hands(found, rig, max_hands=max_hands, frame_names=names)
     for warning in hands.warnings:
         _log.warning("%s", warning)
-    keypoints = _within(hands.keypoints_px, rig)
+    keypoints = within_images(hands.keypoints_px, rig)
     boxes = boxes_from_keypoints(keypoints)
-    return HandBoxes(boxes, hands.hand_side, names, keypoints, _confidence(hands), rig.names, detector)
+    time_s = None if None in times else np.array(times, float)
+    return HandBoxes(
+        boxes, hands.hand_side, names, keypoints, _confidence(hands), rig.names, detector, time_s
+    )
 
 
-def _within(
+def within_images(
     keypoints_px: Float[Array, "frame hand view 21 2"], rig: Rig
 ) -> Float[Array, "frame hand view 21 2"]:
-    """Return the key points with guesses beyond the image's border unseen."""
+    """Return raw pixels with key points that are guessed beyond the image's border unseen (NaN)."""
     inside = (keypoints_px >= 0) & (keypoints_px <= rig.size_wh[:, None])
     return np.where(inside.all(-1, keepdims=True), keypoints_px, np.nan)
 

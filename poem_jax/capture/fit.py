@@ -8,20 +8,23 @@ written; a frame in which a hand cannot be fitted is marked, and stops nothing.
 
 import dataclasses
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from poem_jax.calibration.epipolar import ideal_keypoints
+from poem_jax.calibration.lens_reach import beyond_the_lens
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
+from poem_jax.capture.fit_trust import joint_confidence
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
+from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames, padded_times
+from poem_jax.capture.frame_times import SECONDS_PER_FRAME, times_of
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
 from poem_jax.capture.take import Take
 from poem_jax.fitting.detector_offsets import offsets_of
 from poem_jax.geometry.rig import Rig
-from poem_jax.hand.model import HandModel, mirror
+from poem_jax.hand.pair import Hands
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.typing import Array
 
@@ -36,27 +39,6 @@ _CONTEXT = 16
 """Frames before and after that a smoothed frame is held to; what lies farther does not move it."""
 _FRAMES_FOR_SHAPE = 16
 """A hand's shape is settled by the first group that shows it in so many frames."""
-
-
-class Hands(NamedTuple):
-    """The hand models of both sides."""
-
-    right: HandModel
-    left: HandModel
-
-    def of(self, side: str) -> HandModel:
-        """Return the model of a side."""
-        return self.left if side == "left" else self.right
-
-    def other(self, side: str) -> HandModel:
-        """Return the model of the opposite side."""
-        return self.right if side == "left" else self.left
-
-
-def hands_of(model: HandModel) -> Hands:
-    """Return a hand and its mirror image."""
-    reflected = HandModel(*(np.asarray(array) for array in mirror(model)))
-    return Hands(reflected, model) if model.side == "left" else Hands(model, reflected)
 
 
 def fit_hands(
@@ -87,23 +69,59 @@ def fit_hands(
         _HandFit(name, _keypoint_models(hands, side, offsets), config)
         for name, side in zip(take.hand_names, take.hand_sides, strict=True)
     ]
-    checked = said = False
+    checked = said = told = False
     for group, turns in _windows(frames, _CONTEXT if smooth else 0):
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
+        time_s = times_of(group) if smooth else np.arange(len(group)) * SECONDS_PER_FRAME
         if not checked and shows_palms(raw):
             check_triangulation(take.rig, raw)
             checked = True
         warnings = [] if said else [str(finding) for finding in judge_views(take.rig, raw)]
         said = said or bool(warnings)
-        fitted = []
+        if not told:
+            lost = np.isfinite(raw).all(-1) & ~np.isfinite(keypoints).all(-1)
+            warnings += beyond_the_lens(take.rig, lost.sum((0, 1, 3)), "key points")
+            told = bool(lost.any())
+        fitted, trusted = [], []
         for index, hand in enumerate(fits):
-            fitted.append(hand.fit(keypoints[:, index], confidence[:, index], take.rig))
+            given = keypoints[:, index], confidence[:, index]
+            fitted.append(hand.fit(*given, time_s, take.rig))
+            trusted.append(joint_confidence(fitted[-1], *given, take.rig))
             warnings += hand.take_warnings()
-        for turn in turns:
-            results = tuple(_result(result, turn) for result in fitted)
-            yield group[turn]._replace(hands=results, warnings=(*group[turn].warnings, *warnings))
+        for frame in _with_results(group, turns, fitted, trusted):
+            yield frame._replace(warnings=(*frame.warnings, *warnings))
             warnings = []
+
+
+def try_fit(
+    frames: Iterable[Frame], take: Take, hands: Hands, detector: str | None = None
+) -> Iterator[Frame]:
+    """Fit the hands of a few frames as `fit_hands` does, but judge neither the rig nor the sides.
+
+    Each hand has one shape in all of them.
+    """
+    group = list(frames)
+    raw, confidence = _observed(group)
+    keypoints = ideal_keypoints(take.rig, raw)
+    config = fit_config(take.rig, smooth=False)
+    offsets = offsets_of(take.detector if detector is None else detector)
+    fitted, trusted = [], []
+    evenly = np.arange(len(group)) * SECONDS_PER_FRAME
+    for index, side in enumerate(take.hand_sides):
+        given, model = (keypoints[:, index], confidence[:, index]), _keypoint_models(hands, side, offsets)[0]
+        fitted.append(fit_group(model, *given, evenly, take.rig, config, None))
+        trusted.append(joint_confidence(fitted[-1], *given, take.rig))
+    yield from _with_results(group, range(len(group)), fitted, trusted)
+
+
+def _with_results(
+    group: list[Frame], turns: range, fitted: list["FitResult"], trusted: list[Array]
+) -> Iterator[Frame]:
+    """Give the frames whose turn it is what came of their hands."""
+    for turn in turns:
+        pairs = zip(fitted, trusted, strict=True)
+        yield group[turn]._replace(hands=tuple(fitted_hand(fit, turn, trust) for fit, trust in pairs))
 
 
 def _keypoint_models(
@@ -162,10 +180,10 @@ class _HandFit:
         self._judged = self._said = False
         self._warnings: list[str] = []
 
-    def fit(self, keypoints: Array, confidence: Array, rig: Rig) -> "FitResult":
-        """Fit a group of frames: key points (frame, view, 21, 2) and their confidence."""
+    def fit(self, keypoints: Array, confidence: Array, time_s: Array, rig: Rig) -> "FitResult":
+        """Fit a group of frames: key points (frame, view, 21, 2), their confidence, and their times."""
         own, other = (
-            _run(model, keypoints, confidence, rig, self._config, shape)
+            fit_group(model, keypoints, confidence, time_s, rig, self._config, shape)
             for model, shape in zip(self._models, self._shapes, strict=True)
         )
         enough = own.valid.sum() >= _FRAMES_FOR_SHAPE
@@ -182,15 +200,28 @@ class _HandFit:
         return warnings
 
 
-def _run(
+def fit_group(
     model: "KeypointModel",
     keypoints: Array,
     confidence: Array,
+    time_s: Array,
     rig: Rig,
     config: "FitConfig",
     shape: Array | None,
+    together: int = FRAMES_TOGETHER,
 ) -> "FitResult":
-    """Fit a group of frames, padded to the one size for which there is a program; None = unknown shape."""
+    """Fit a hand to a group of frames, padded to a size for which there is a program.
+
+    Args:
+        model: The hand.
+        keypoints: (frame, view, 21, 2), pixels without distortion; NaN = unseen.
+        confidence: Of the key points (frame, view, 21).
+        time_s: When the frames were taken.
+        rig: The cameras.
+        config: Of the fit.
+        shape: Of the hand (10,); None = unknown, one for all frames.
+        together: The group is padded to a multiple of it.
+    """
     import jax
 
     from poem_jax.fitting import Observations, fit_take
@@ -199,13 +230,20 @@ def _run(
     if shape is not None:
         lm = dataclasses.replace(config.lm, shape_mode=ShapeMode.GIVEN)
         config = dataclasses.replace(config, lm=lm)
-    padded = (padded_frames(keypoints), padded_frames(confidence))
+    padded = (padded_frames(keypoints, together), padded_frames(confidence, together))
     observations = Observations(*padded, rig.K, rig.T_cam_from_world)
-    fitted = jax.device_get(fit_take(model, observations, shape, config))
+    fitted = jax.device_get(fit_take(model, observations, shape, config, padded_times(time_s, together)))
     return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
 
 
-def _result(fitted: "FitResult", turn: int) -> HandResult:
+def fitted_hand(fitted: "FitResult", turn: int, trusted: Array) -> HandResult:
+    """Return what a fit says of the hand in frame number `turn`, or why it says nothing.
+
+    Args:
+        fitted: The hand over some frames.
+        turn: The frame.
+        trusted: `fit_trust.joint_confidence` of the fit.
+    """
     used = fitted.inlier_mask[turn].any(-1)
     if not fitted.valid[turn]:
         return HandResult(used, NOT_FITTED)
@@ -219,4 +257,6 @@ def _result(fitted: "FitResult", turn: int) -> HandResult:
         translation=fitted.translation[turn],
         expected_world=fitted.keypoints[turn],
         joint_sigma_m=fitted.sigma_m[turn],
+        joint_confidence=trusted[turn],
+        alone_world=fitted.alone[turn],
     )

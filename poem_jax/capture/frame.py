@@ -4,9 +4,9 @@ Every stage takes a stream of frames and gives one on, with its own fields fille
 not need is dropped on the way, so that memory does not grow with the take.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
+from poem_jax.io.video import ImageSource
 from poem_jax.typing import Array, Bool, Float, UInt8
 
 
@@ -55,6 +55,8 @@ class HandResult(NamedTuple):
     """Share of the joints that the view's lens shows; NaN = view not used."""
     joint_confidence: Float[Array, "view 21"] | None = None
     """How far each view's picture of each joint bears the result out, 0 to 1; NaN = not seen there."""
+    alone_world: Float[Array, "21 3"] | None = None
+    """The joints as this moment alone shows them; None = as `joints_world`."""
     bridged: bool = False
     """Whether the hand was not seen at this moment, and stands between those before and after it."""
 
@@ -69,8 +71,8 @@ class Frame(NamedTuple):
     keypoints_px: Float[Array, "hand view 21 2"] | None = None
     """In the photographs; NaN = unseen; None where the capture comes with boxes alone."""
     confidence: Float[Array, "hand view 21"] | None = None
-    image_files: tuple[Path | None, ...] = ()
-    """One per view; None = there is none."""
+    image_files: tuple[ImageSource | None, ...] = ()
+    """One per view, a file or a frame of a video; None = there is none."""
     squares_px: Float[Array, "hand view 4"] | None = None
     """The square about each hand, in pixels without distortion; NaN = unseen."""
     images: tuple[UInt8[Array, "h w 3"] | None, ...] = ()

@@ -9,7 +9,7 @@ Costs are in nats. Sides: with the log odds s of a track and t of a piece, joini
 log cosh(s/2) + |t|/2 - log cosh((s + t)/2), about min(|s|, |t|) where they differ, little where they agree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +21,9 @@ from poem_jax.typing import Array, Float
 SURE_LINK = 2.0
 """A way to follow hands must be likelier than any other by this, nats, to be taken for sure."""
 
-_MOTION_SCALE_M = 0.04
+MOTION_SCALE_M = 0.04
 """A hand is this far from where its motion takes it, in the mean over joints (exponential distribution)."""
-_MAX_LINK = 6.0
+MAX_LINK = 6.0
 """Cost of a link between neighbouring frames above which the hand is not the same, or has jumped."""
 _JUMP_WEIGHT = 1.2
 _MAX_JUMP = 4.0
@@ -36,7 +36,7 @@ _BIRTH = 6.0
 _DAMPING = 0.8
 _MOST_FRAMES_AHEAD = 4
 """Velocity says nothing about where a hand is later than this."""
-_WEIGHT_OF_VOTES = 0.25
+WEIGHT_OF_VOTES = 0.25
 """Votes of one hand go together from frame to frame and view to view."""
 _MAX_VOTE_OF_LINK = 3.0
 _BEAM = 48
@@ -59,7 +59,7 @@ class Piece(NamedTuple):
     @property
     def vote(self) -> float:
         """Log odds that it is a right hand."""
-        return _WEIGHT_OF_VOTES * sum(hand.vote for hand in self.hands)
+        return WEIGHT_OF_VOTES * sum(hand.vote for hand in self.hands)
 
 
 class Track(NamedTuple):
@@ -71,7 +71,7 @@ class Track(NamedTuple):
     @property
     def vote(self) -> float:
         """Log odds that it is a right hand."""
-        return _WEIGHT_OF_VOTES * sum(hand.vote for hand in self.hands.values())
+        return WEIGHT_OF_VOTES * sum(hand.vote for hand in self.hands.values())
 
     @property
     def seen(self) -> int:
@@ -101,7 +101,7 @@ class _Way(NamedTuple):
     """Of every track."""
 
 
-def follow_hands(frames: Sequence[Sequence[PlacedHand]]) -> Tracks:
+def follow_hands(frames: Iterable[Sequence[PlacedHand]]) -> Tracks:
     """Follow the hands of a take.
 
     Args:
@@ -124,24 +124,47 @@ def follow_hands(frames: Sequence[Sequence[PlacedHand]]) -> Tracks:
     return Tracks(tracks, _unsure_joins(pieces, ways), jumps)
 
 
-def link_frames(frames: Sequence[Sequence[PlacedHand]]) -> list[Piece]:
+class _OpenPiece:
+    """A piece that may go on: what a long take adds a frame to costs the same in every frame."""
+
+    def __init__(self, start: int, hand: PlacedHand) -> None:
+        self._start, self._hands = start, [hand]
+        self._votes = hand.vote
+
+    def add(self, hand: PlacedHand) -> "_OpenPiece":
+        self._hands.append(hand)
+        self._votes += hand.vote
+        return self
+
+    @property
+    def last_two(self) -> Sequence[PlacedHand]:
+        return self._hands[-2:]
+
+    @property
+    def vote(self) -> float:
+        return WEIGHT_OF_VOTES * self._votes
+
+    def closed(self) -> Piece:
+        return Piece(self._start, tuple(self._hands))
+
+
+def link_frames(frames: Iterable[Sequence[PlacedHand]]) -> list[Piece]:
     """Return the runs of frames in which hands can be followed without doubt, by their beginnings."""
-    open_pieces: list[Piece] = []
+    open_pieces: list[_OpenPiece] = []
     closed: list[Piece] = []
     for frame, hands in enumerate(frames):
         links = _links(open_pieces, hands)
-        closed += [piece for i, piece in enumerate(open_pieces) if i not in links]
+        closed += [piece.closed() for i, piece in enumerate(open_pieces) if i not in links]
         taken = {hand: piece for piece, hand in links.items()}
         open_pieces = [
-            open_pieces[taken[i]]._replace(hands=(*open_pieces[taken[i]].hands, hand))
-            if i in taken
-            else Piece(frame, (hand,))
+            open_pieces[taken[i]].add(hand) if i in taken else _OpenPiece(frame, hand)
             for i, hand in enumerate(hands)
         ]
-    return sorted([*closed, *open_pieces], key=lambda piece: (piece.start, piece.last))
+    closed += [piece.closed() for piece in open_pieces]
+    return sorted(closed, key=lambda piece: (piece.start, piece.last))
 
 
-def _links(pieces: Sequence[Piece], hands: Sequence[PlacedHand]) -> dict[int, int]:
+def _links(pieces: Sequence[_OpenPiece], hands: Sequence[PlacedHand]) -> dict[int, int]:
     """Return which piece goes on as which hand, without those links that another way nearly equals.
 
     The table of costs has one more column for every piece (it ends) and one more row for every hand (it
@@ -151,7 +174,7 @@ def _links(pieces: Sequence[Piece], hands: Sequence[PlacedHand]) -> dict[int, in
     if not n or not m:
         return {}
     table = np.zeros((n + m, n + m))
-    table[:n, m:] = table[n:, :m] = _MAX_LINK / 2
+    table[:n, m:] = table[n:, :m] = MAX_LINK / 2
     table[:n, :m] = [[_link_cost(piece, hand) for hand in hands] for piece in pieces]
     rows, columns = linear_sum_assignment(table)
     chosen = table[rows, columns]
@@ -166,10 +189,10 @@ def _links(pieces: Sequence[Piece], hands: Sequence[PlacedHand]) -> dict[int, in
     }
 
 
-def _link_cost(piece: Piece, hand: PlacedHand) -> float:
-    expected = piece.hands[-1].joints_world + _velocity(piece.hands[-2:])
-    sides = _cost_of_sides(*(np.clip((piece.vote, hand.vote), -_MAX_VOTE_OF_LINK, _MAX_VOTE_OF_LINK)))
-    return _distance(expected, hand.joints_world) / _MOTION_SCALE_M + sides
+def _link_cost(piece: _OpenPiece, hand: PlacedHand) -> float:
+    expected = piece.last_two[-1].joints_world + _velocity(piece.last_two)
+    sides = cost_of_sides(*(np.clip((piece.vote, hand.vote), -_MAX_VOTE_OF_LINK, _MAX_VOTE_OF_LINK)))
+    return mean_distance(expected, hand.joints_world) / MOTION_SCALE_M + sides
 
 
 def _velocity(hands: Sequence[PlacedHand]) -> Float[Array, "3"]:
@@ -181,14 +204,14 @@ def _velocity(hands: Sequence[PlacedHand]) -> Float[Array, "3"]:
     return _DAMPING * np.median(moved, axis=0) if len(moved) else np.zeros(3)
 
 
-def _distance(a: Float[Array, "21 3"], b: Float[Array, "21 3"]) -> float:
+def mean_distance(a: Float[Array, "21 3"], b: Float[Array, "21 3"]) -> float:
     """Return the mean distance of the joints that both have, metres; infinite without any."""
     distances = np.linalg.norm(a - b, axis=-1)
     distances = distances[np.isfinite(distances)]
     return float(distances.mean()) if len(distances) else np.inf
 
 
-def _cost_of_sides(a: float, b: float) -> float:
+def cost_of_sides(a: float, b: float) -> float:
     """Return what it costs that two log odds belong to one hand."""
     return _log_cosh(a / 2) + abs(b) / 2 - _log_cosh((a + b) / 2)
 
@@ -212,7 +235,7 @@ def _continued(way: _Way, pieces: Sequence[Piece], number: int, piece: Piece) ->
     options = []
     for track, last in enumerate(way.last):
         if pieces[last].last < piece.start:
-            cost = _jump_cost(pieces[last], piece) + _cost_of_sides(way.votes[track], vote)
+            cost = _jump_cost(pieces[last], piece) + cost_of_sides(way.votes[track], vote)
             options.append((cost, track))
     options = [*sorted(options)[: _MAX_BRANCHES - 1], (_BIRTH, len(way.last))]
     return [
@@ -228,7 +251,7 @@ def _continued(way: _Way, pieces: Sequence[Piece], number: int, piece: Piece) ->
 
 def _jump_cost(a: Piece, b: Piece) -> float:
     """Return what it costs that piece b goes on where piece a ended."""
-    scale = _MOTION_SCALE_M * np.sqrt(b.start - a.last)
+    scale = MOTION_SCALE_M * np.sqrt(b.start - a.last)
     return min(_JUMP_WEIGHT * float(np.log1p(_jump_m(a, b) / scale)), _MAX_JUMP)
 
 
@@ -237,8 +260,8 @@ def _jump_m(a: Piece, b: Piece) -> float:
     gap = b.start - a.last
     ahead = min(gap, _MOST_FRAMES_AHEAD)
     end, begin = a.hands[-1].joints_world, b.hands[0].joints_world
-    forward = _distance(end + ahead * _velocity(a.hands[-2:]), begin)
-    backward = _distance(begin + ahead * _velocity(b.hands[1::-1]), end)
+    forward = mean_distance(end + ahead * _velocity(a.hands[-2:]), begin)
+    backward = mean_distance(begin + ahead * _velocity(b.hands[1::-1]), end)
     return (forward + backward) / 2
 
 

@@ -46,48 +46,41 @@ def judge_hands(frames: Iterable[Frame], rig: Rig) -> Iterator[Frame]:
     views = _Views(rig)
     said_twins = False
     for frame in frames:
-        hands = tuple(
-            hand if hand.joints_world is None else _measured(hand, _evidence(frame, index), rig)
-            for index, hand in enumerate(frame.hands)
-        )
+        hands = _measured(frame, rig)
         twins = () if said_twins else _twins(hands)
         said_twins = said_twins or bool(twins)
         yield frame._replace(hands=hands, warnings=(*frame.warnings, *views.judge(hands), *twins))
 
 
 def joints_shown(
-    joints_world: Float[Array, "21 3"], view_mask: Bool[Array, " view"], rig: Rig
+    joints_px: Float[Array, "view 21 2"], view_mask: Bool[Array, " view"]
 ) -> Float[Array, " view"]:
     """Return the share of the joints that the lens of each view shows, in or beside its image.
 
-    The others, behind the camera or beyond the fold of the lens, have no reprojection error. Masked views
-    hold NaN.
+    The others, behind the camera or beyond the fold of the lens, are NaN in `joints_px`, and have no
+    reprojection error. Masked views hold NaN.
     """
-    shares = np.full(len(rig.names), np.nan)
-    for view in np.flatnonzero(view_mask):
-        shares[view] = np.isfinite(project_raw(rig, int(view), joints_world)[0]).all(-1).mean()
-    return shares
+    return np.where(view_mask, np.isfinite(joints_px).all(-1).mean(-1), np.nan)
 
 
-def reprojection_error(
-    joints_world: Float[Array, "21 3"], evidence: Evidence, rig: Rig
-) -> Float[Array, " view"]:
+def reprojection_error(joints_px: Float[Array, "view 21 2"], evidence: Evidence) -> Float[Array, " view"]:
     """Return the mean distance in raw pixels per view between the evidence and the projected joints.
 
     Views without evidence hold NaN.
     """
-    errors = np.full(len(rig.names), np.nan)
-    for view in np.flatnonzero(np.isfinite(evidence.points_px).all(-1).any(-1)):
-        projected, _ = project_raw(rig, int(view), joints_world[list(evidence.joints)])
-        distances = np.linalg.norm(projected - evidence.points_px[view], axis=-1)
-        seen = np.isfinite(distances)
-        if seen.any():
-            errors[view] = distances[seen].mean()
-    return errors
+    distances = np.linalg.norm(joints_px[:, list(evidence.joints)] - evidence.points_px, axis=-1)
+    seen = np.isfinite(distances)
+    total = np.where(seen, distances, 0.0).sum(-1)
+    return np.where(seen.any(-1), total / np.maximum(seen.sum(-1), 1), np.nan)
 
 
 def _evidence(frame: Frame, index: int) -> Evidence | None:
-    """Return the key points that were given, else those of the heat maps, else None."""
+    """Return the key points that were given, else those of the heat maps, else None.
+
+    A hand that was bridged stands where it was not seen: nothing bears it out.
+    """
+    if frame.hands[index].bridged:
+        return None
     if frame.keypoints_px is not None:
         return Evidence(frame.keypoints_px[index], _ALL_JOINTS)
     points_px = frame.hands[index].keypoints_px
@@ -96,13 +89,28 @@ def _evidence(frame: Frame, index: int) -> Evidence | None:
     return Evidence(points_px, (ROOT_JOINT,) if points_px.shape[-2] == 1 else _ALL_JOINTS)
 
 
-def _measured(hand: HandResult, evidence: Evidence | None, rig: Rig) -> HandResult:
-    nothing = np.full(len(rig.names), np.nan)
-    expected = hand.joints_world if hand.expected_world is None else hand.expected_world
-    return hand._replace(
-        reprojection_px=nothing if evidence is None else reprojection_error(expected, evidence, rig),
-        joints_shown=joints_shown(hand.joints_world, hand.view_mask, rig),
-    )
+def _measured(frame: Frame, rig: Rig) -> tuple[HandResult, ...]:
+    """Give the hands of a frame their errors; all points go through a lens together, which takes a while."""
+    found = [index for index, hand in enumerate(frame.hands) if hand.joints_world is not None]
+    hands = list(frame.hands)
+    if not found:
+        return frame.hands
+    points = [np.stack([np.asarray(hands[i].joints_world), _expected(hands[i])]) for i in found]
+    flat = np.concatenate(points).reshape(-1, 3)
+    pixels = np.stack([project_raw(rig, view, flat)[0] for view in range(rig.num_views)])
+    pixels = np.moveaxis(pixels.reshape(rig.num_views, len(found), 2, NUM_JOINTS, 2), 0, 2)
+    for index, (joints_px, expected_px) in zip(found, pixels, strict=True):
+        evidence = _evidence(frame, index)
+        nothing = np.full(rig.num_views, np.nan)
+        hands[index] = hands[index]._replace(
+            reprojection_px=nothing if evidence is None else reprojection_error(expected_px, evidence),
+            joints_shown=joints_shown(joints_px, hands[index].view_mask),
+        )
+    return tuple(hands)
+
+
+def _expected(hand: HandResult) -> Array:
+    return np.asarray(hand.joints_world if hand.expected_world is None else hand.expected_world)
 
 
 def _twins(hands: Sequence[HandResult]) -> list[str]:

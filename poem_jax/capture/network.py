@@ -15,6 +15,14 @@ import numpy as np
 
 from poem_jax.batch import Prediction
 from poem_jax.capture.frame import Frame, HandCrops, HandResult
+from poem_jax.capture.network_trust import (
+    GENERAL,
+    SHIPPED,
+    TrustScale,
+    doubts_of,
+    joint_confidence,
+    joint_sigma,
+)
 from poem_jax.capture.take import Take, in_groups
 from poem_jax.geometry.cameras import (
     Cameras,
@@ -28,7 +36,8 @@ from poem_jax.geometry.cameras import (
 from poem_jax.geometry.distortion import distort
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
-from poem_jax.hand.model import mirror_pose
+from poem_jax.hand.model import HandModel, mirror_pose
+from poem_jax.hand.pair import Hands, hands_of
 from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.models.config import ModelConfig
 from poem_jax.models.infer import Prepared, infer_unchecked, prepare
@@ -50,11 +59,21 @@ class Network(NamedTuple):
     origin: str = "given"
     """Where the weights came from, for the report."""
     predict: Callable[[Prepared, Array, Cameras], Prediction] = infer_unchecked
+    trust: TrustScale = GENERAL
+    """What the model's signs of doubt are worth."""
 
     def faces(self) -> dict[str, Int[Array, "face 3"]]:
         """Return the triangles of the model's hand, and those of its mirror image, facing outwards."""
         right = np.asarray(self.prepared.params["constants"]["hand"]["faces"])
         return {"right": right, "left": np.ascontiguousarray(right[:, ::-1])}
+
+    def hands(self) -> Hands | None:
+        """Return the model's hand, of which it may give pose, shape and place, and its mirror image; None
+        where it has triangles alone."""
+        fields = self.prepared.params["constants"]["hand"]
+        if not set(HandModel._fields) <= set(fields):
+            return None
+        return hands_of(HandModel(**{name: fields[name] for name in HandModel._fields}))
 
 
 def load_network(checkpoint: str | os.PathLike | None) -> Network:
@@ -63,15 +82,19 @@ def load_network(checkpoint: str | os.PathLike | None) -> Network:
     Raises: FileNotFoundError, ValueError: As `poem_jax.load`.
     """
     config, params = store.shipped() if checkpoint is None else store.load(checkpoint)
-    return make_network(config, params, "shipped weights" if checkpoint is None else str(checkpoint))
+    if checkpoint is None:
+        return make_network(config, params, "shipped weights", SHIPPED)
+    return make_network(config, params, str(checkpoint))
 
 
-def make_network(config: ModelConfig, params: Params, origin: str = "given") -> Network:
+def make_network(
+    config: ModelConfig, params: Params, origin: str = "given", trust: TrustScale = GENERAL
+) -> Network:
     """Prepare a model in memory.
 
     Raises: ValueError: The parameters are of another config.
     """
-    return Network(config, prepare(params, config), origin)
+    return Network(config, prepare(params, config), origin, trust=trust)
 
 
 def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iterator[Frame]:
@@ -95,9 +118,10 @@ def predict_hands(frames: Iterable[Frame], take: Take, network: Network) -> Iter
             _predict(network, fed[i : i + batch_size], take.rig.num_views, batch_size)
             for i in range(0, len(fed), batch_size)
         )
+        given = iter(fed)
         for frame in group:
             results = (
-                _result(crop, next(predicted), known, side, take.rig, views_needed(network.config))
+                _result(network, crop, next(given), next(predicted), known, side, take.rig)
                 for crop, known, side in zip(frame.crops, frame.hands, take.hand_sides, strict=True)
             )
             yield frame._replace(hands=tuple(results), crops=())
@@ -154,22 +178,25 @@ def _predict(
 
 
 def _result(
+    network: Network,
     crops: HandCrops | None,
+    fed: HandCrops | None,
     predicted: Prediction | None,
     known: HandResult,
     side: str,
     rig: Rig,
-    needed: int,
 ) -> HandResult:
-    """Bring a prediction back to the capture's world, or say why there is none."""
+    """Bring a prediction for the crops `fed` back to the capture's world, or say why there is none."""
     if crops is None:
         return known
-    views = int(crops.view_mask.sum())
+    views, needed = int(crops.view_mask.sum()), views_needed(network.config)
     if views < needed:
         wanted = "two are" if needed == 2 else "one is"
         return HandResult(crops.view_mask, f"seen in {views} view(s); {wanted} needed")
     if predicted is None or not predicted.valid:
         return HandResult(crops.view_mask, UNDETERMINED)
+    assert fed is not None
+    doubts = doubts_of(predicted, fed, network.config.query_order)
     if side == "left":
         predicted = _mirrored_back(predicted, crops.views.shape[2])
     # A model without a root of its own still says where the root joint is.
@@ -186,6 +213,8 @@ def _result(
         shape=predicted.shape,
         translation=predicted.translation,
         keypoints_px=_where_given(lambda px: _in_photographs(px, crops, rig), predicted.keypoints_px),
+        joint_confidence=joint_confidence(doubts, network.trust),
+        joint_sigma_m=joint_sigma(doubts, network.trust),
     )
 
 

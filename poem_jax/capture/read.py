@@ -1,9 +1,12 @@
-"""The stage `read`: the photographs of each frame. An image that is lost costs its view, not the take."""
+"""The stage `read`: the photographs of each frame. An image that is lost costs its view, not the take.
+
+The next frames are read in a thread while the caller works on this one.
+"""
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from itertools import combinations
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,11 +14,16 @@ import numpy as np
 from poem_jax.capture.frame import Frame, ImageProblem
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.images import read_image
+from poem_jax.io.reading_ahead import read_ahead
+from poem_jax.io.video import ImageSource, VideoFrame
 from poem_jax.typing import Array, Float, UInt8
 
 _SMALL_PX = 64
 _ONE_COLOUR, _SAME = 4.0, 8.0
 """Levels of 255 in an image in small; compressing it again changes few by more than 3."""
+
+ReadView = UInt8[Array, "_ _ 3"] | FileNotFoundError | ValueError | None
+"""The image of a view, or why there is none; None = no image was expected."""
 
 _log = logging.getLogger(__name__)
 
@@ -34,38 +42,43 @@ def read_images(
     Raises:
         FileNotFoundError, ValueError: A needed image is lost, and `go_on` is False.
     """
-    for frame in frames:
+    for frame, views in read_ahead(frames, partial(_views_of, rig=rig)):
         sees_hand = np.isfinite(frame.boxes_px).all(-1).any(0) & needed
         images: list[UInt8[Array, "h w 3"] | None] = []
         problems: list[ImageProblem] = []
-        for view, path in enumerate(frame.image_files):
-            try:
-                images.append(_read_view(path, rig, view, frame.name, bool(sees_hand[view])))
-            except (FileNotFoundError, ValueError) as error:
+        for view, image in enumerate(views):
+            if image is None and sees_hand[view]:
+                image = _no_image(rig.names[view], frame.name)
+            if isinstance(image, FileNotFoundError | ValueError):
                 if sees_hand[view] and not go_on:
-                    raise
-                images.append(None)
-                problems.append(ImageProblem(bool(sees_hand[view]), error))
-                _log.warning("frame %s: an image is left out: %s", frame.name, error)
+                    raise image
+                problems.append(ImageProblem(bool(sees_hand[view]), image))
+                _log.warning("frame %s: an image is left out: %s", frame.name, image)
+            images.append(image if isinstance(image, np.ndarray) else None)
         frame = frame._replace(images=tuple(images), problems=tuple(problems))
         yield with_odd_images_told(frame, rig) if needed else frame
 
 
-def image_of_camera(path: Path, rig: Rig, view: int) -> UInt8[Array, "h w 3"]:
-    """Read an image of the size for which the camera was calibrated; errors as `read_image`."""
+def read_views(sources: Sequence[ImageSource | None], rig: Rig) -> list[ReadView]:
+    """Read the images of one moment, of the sizes for which the cameras were calibrated."""
+    return [None if source is None else _read_view(source, rig, view) for view, source in enumerate(sources)]
+
+
+def _read_view(source: ImageSource, rig: Rig, view: int) -> ReadView:
     width, height = rig.size_wh[view]
-    return read_image(path, (int(width), int(height)))
+    size_wh = int(width), int(height)
+    try:
+        return source.read(size_wh) if isinstance(source, VideoFrame) else read_image(source, size_wh)
+    except (FileNotFoundError, ValueError) as error:
+        return error
 
 
-def _read_view(
-    path: Path | None, rig: Rig, view: int, frame: str, needed: bool
-) -> UInt8[Array, "h w 3"] | None:
-    if path is not None:
-        return image_of_camera(path, rig, view)
-    if not needed:
-        return None
-    camera = rig.names[view]
-    raise FileNotFoundError(
+def _views_of(frame: Frame, rig: Rig) -> list[ReadView]:
+    return read_views(frame.image_files, rig)
+
+
+def _no_image(camera: str, frame: str) -> FileNotFoundError:
+    return FileNotFoundError(
         f"frame {frame}: camera '{camera}' has a box but no image; expected {camera}.jpg or .png "
         "(to leave the view out, give it NaN boxes)"
     )

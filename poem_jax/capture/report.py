@@ -71,6 +71,9 @@ class Report:
         self.warnings: list[str] = []
         self._take = take
         self._errors: list[Array] = []
+        self._times: list[float] = []
+        self._bridged = [0] * len(take.hand_sides)
+        self._sigmas_mm: list[float] = []
         self._views_used = 0
         self._against = "the key points given"
         self._problem: FileNotFoundError | ValueError | None = None
@@ -96,6 +99,10 @@ class Report:
             self._against = _NOTHING if no_maps else "the model's own heat maps"
         self._errors += [np.asarray(hand.reprojection_px, np.float32) for hand in solved]
         self._views_used += sum(int(hand.view_mask.sum()) for hand in frame.hands)
+        self._times.append(np.nan if frame.time_s is None else frame.time_s)
+        self._bridged = [n + hand.bridged for n, hand in zip(self._bridged, frame.hands, strict=True)]
+        sigmas = [hand.joint_sigma_m for hand in solved if hand.joint_sigma_m is not None]
+        self._sigmas_mm += [1000 * float(np.median(sigma)) for sigma in sigmas]
         self._keep_reasons(frame)
         new = [warning for warning in frame.warnings if warning not in self.warnings]
         self.warnings += new
@@ -122,14 +129,17 @@ class Report:
         """Write the file, whole or not at all. `about` says what the engine was."""
         content = {
             "timings_s": timings_s,
-            "reprojection": self._reprojection(),
+            "reprojection": self.reprojection(),
             **about,
             "warnings": self.warnings,
             "cameras": self._take.rig.names,
             "hands": self._take.hand_names,
             "num_frames": self.frames,
+            "frames_per_second": self._frames_per_second(),
             "num_hands": self.hands,
             "solved_hands": self.solved,
+            "bridged_frames": dict(zip(self._take.hand_names, self._bridged, strict=True)),
+            "median_joint_sigma_mm": float(np.median(self._sigmas_mm)) if self._sigmas_mm else None,
             "failed_frames": self.failed_frames,
             "versions": versions(),
         }
@@ -158,13 +168,31 @@ class Report:
             if self._best is None or hand.view_mask.sum() > self._best.view_mask.sum():
                 self._best = hand
 
-    def _reprojection(self) -> dict[str, Any]:
-        errors = np.concatenate(self._errors) if self._errors else np.zeros(0)
+    def _frames_per_second(self) -> float | None:
+        """Return the usual rate, None where the frames' times are not known."""
+        steps = np.diff(self._times)
+        steps = steps[np.isfinite(steps) & (steps > 0)]
+        return float(1 / np.median(steps)) if steps.size else None
+
+    @property
+    def num_cameras(self) -> int:
+        """How many cameras the take has."""
+        return self._take.rig.num_views
+
+    def reprojection(self) -> dict[str, Any]:
+        """Return what the errors in the photographs are so far, and against what."""
+        errors = np.stack(self._errors) if self._errors else np.zeros((0, self._take.rig.num_views))
         seen = errors[np.isfinite(errors)]
+        medians = {
+            camera: float(np.median(column[np.isfinite(column)]))
+            for camera, column in zip(self._take.rig.names, errors.T, strict=True)
+            if np.isfinite(column).any()
+        }
         return {
             "against": self._against,
             "mean_px": float(seen.mean()) if seen.size else None,
             "median_px": float(np.median(seen)) if seen.size else None,
+            "median_px_by_camera": medians,
             "views_used": self._views_used,
         }
 
@@ -189,6 +217,8 @@ def versions() -> dict[str, str]:
 def _entry(frame: Frame, take: Take) -> dict[str, Any]:
     """Say in plain types what came of a frame."""
     entry: dict[str, Any] = {"frame": frame.name}
+    if frame.time_s is not None:
+        entry["time_s"] = frame.time_s
     if frame.problems:
         entry["image_problems"] = [str(problem.error) for problem in frame.problems]
     pairs = zip(take.hand_names, frame.hands, strict=True)
@@ -200,6 +230,8 @@ def _hand_entry(name: str, hand: HandResult, rig: Rig) -> dict[str, Any]:
     entry: dict[str, Any] = {"hand": name, "valid": hand.reason is None, "views_used": used}
     if hand.reason is not None:
         return {**entry, "reason": hand.reason}
+    if hand.bridged:
+        entry["bridged"] = True
     entry["reprojection_px"] = _by_camera(rig, hand.reprojection_px)
     entry["joints_shown"] = _by_camera(rig, hand.joints_shown)
     if hand.joint_sigma_m is not None:

@@ -6,6 +6,7 @@ count alike.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,10 @@ MAX_VOTE = 2.0
 _TRUSTED_SHARE = 2 / 3
 """Of a hand's joints, the nearest: tips and hidden joints are often wrong."""
 _MIN_JOINTS = 10
+_TOGETHER = 64
+"""Frames whose rays are computed at once."""
+_KEPT = 4
+"""Such groups that are kept: whoever goes through the frames, or back, has each computed once."""
 
 
 class Sightings(NamedTuple):
@@ -50,8 +55,33 @@ class Sightings(NamedTuple):
     num_views: int
 
 
-def sightings_of_frames(detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig) -> list[Sightings]:
-    """Return the rays and votes of the detections of every frame, (frame, view, found)."""
+class SightingsOfFrames(Sequence[Sightings]):
+    """The rays and votes of the detections of every frame, computed when they are asked for.
+
+    A detection's rays take 15 times the memory of its key points.
+    """
+
+    def __init__(self, detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig) -> None:
+        """`detections`: by frame, view and hand found."""
+        self._length = len(detections)
+
+        @lru_cache(_KEPT)
+        def group(number: int) -> list[Sightings]:
+            rows = range(number * _TOGETHER, min((number + 1) * _TOGETHER, self._length))
+            return _sightings_of_group([detections[row] for row in rows], rig)
+
+        self._group = group
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, frame: int) -> Sightings:
+        if not 0 <= frame < self._length:
+            raise IndexError(frame)
+        return self._group(frame // _TOGETHER)[frame % _TOGETHER]
+
+
+def _sightings_of_group(detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig) -> list[Sightings]:
     places = [
         (frame, view, number)
         for frame, views in enumerate(detections)

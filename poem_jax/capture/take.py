@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from poem_jax.capture.boxes_file import (
     HOW_TO_GET_BOXES,
     HandBoxes,
@@ -15,7 +17,10 @@ from poem_jax.capture.boxes_file import (
     without_boxes_outside,
 )
 from poem_jax.capture.frame import Frame
-from poem_jax.data.capture_folder import FramePaths, find_frames, find_rig, frame_key, hand_names
+from poem_jax.capture.moments import Moments, find_moments
+from poem_jax.capture.picked_frames import PickedFrames
+from poem_jax.capture.timing import Timing
+from poem_jax.data.capture_folder import FramePaths, find_rig, frame_key, hand_names
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import safe_file_names
 
@@ -34,6 +39,8 @@ class Take(NamedTuple):
     """In order, taken one after the other; how many there are need not be known."""
     detector: str | None = None
     """What found the key points, as their file names it; None = it does not say."""
+    frames_per_second: float | None = None
+    """Of the frames as taken; None = only their order is known."""
 
     @property
     def hand_names(self) -> tuple[str, ...]:
@@ -59,21 +66,28 @@ class StoredFrames:
 
     def __iter__(self) -> Iterator[Frame]:
         hands = self.hands
-        for index, (name, images) in enumerate(self.paths):
+        for index, (name, images, time_s) in enumerate(self.paths):
             keypoints = None if hands.keypoints_px is None else hands.keypoints_px[index]
             confidence = None if hands.confidence is None else hands.confidence[index]
-            yield Frame(name, hands.boxes_px[index], keypoints, confidence, images)
+            if hands.time_s is not None and np.isfinite(hands.time_s[index]):
+                time_s = float(hands.time_s[index])
+            yield Frame(name, hands.boxes_px[index], keypoints, confidence, images, time_s=time_s)
 
 
 def read_take(
-    folder: str | os.PathLike, rig: str | os.PathLike | None = None, boxes: str | os.PathLike | None = None
+    folder: str | os.PathLike,
+    rig: str | os.PathLike | None = None,
+    boxes: str | os.PathLike | None = None,
+    timing: Timing | None = None,
 ) -> Take:
     """Read rig and boxes of a capture, and list its frames.
 
     Args:
-        folder: One image per camera, or `frames/<frame>/<camera>.jpg`.
+        folder: With a video, or a folder of images, for each camera; with one image for each, or
+            `frames/<frame>/<camera>.jpg`.
         rig: Rig file; None = `rig.json` or `calibration/rig.json` in the folder.
         boxes: File of boxes or key points; None = `boxes.npz` in the folder.
+        timing: The cameras' offsets, and which part of the take; None = all of it.
 
     Raises:
         FileNotFoundError: Folder, rig, boxes or images are missing.
@@ -83,13 +97,14 @@ def read_take(
     if not folder.is_dir():
         raise FileNotFoundError(f"no capture folder at {folder}")
     found = find_rig(folder, rig)
-    paths = find_frames(folder, found.names)
+    moments = find_moments(folder, found, Timing() if timing is None else timing)
     boxes_file = boxes_beside(folder) if boxes is None else Path(boxes)
     if boxes_file is None:
         looked = " or ".join(str(folder / name) for name in BOXES_FILES)
         raise FileNotFoundError(f"no {looked}: {HOW_TO_GET_BOXES}")
-    names = [frame.name for frame in paths]
-    return make_take(found, paths, align_boxes(read_boxes(boxes_file), names, found.names, boxes_file))
+    names = [frame.name for frame in moments.frames]
+    hands = align_boxes(read_boxes(boxes_file), names, found.names, boxes_file)
+    return make_take(found, moments.frames, hands, moments.frames_per_second)
 
 
 def boxes_beside(folder: Path) -> Path | None:
@@ -101,6 +116,7 @@ def read_keypoint_take(
     keypoints: str | os.PathLike,
     rig: str | os.PathLike | None = None,
     images: str | os.PathLike | None = None,
+    timing: Timing | None = None,
 ) -> Take:
     """Read key points and rig; the frames are those of the key-point file.
 
@@ -108,7 +124,8 @@ def read_keypoint_take(
         keypoints: File of key points.
         rig: Rig file; None = `rig.json` or `calibration/rig.json` in the folder `images` where that is given,
             else beside the key points.
-        images: Capture folder to draw on; its frames are found by name. None = no images.
+        images: Capture folder to draw on, as for `read_take`; its frames are found by name. None = no images.
+        timing: The cameras' offsets, where the images are videos; the part of the take is the key points'.
 
     Raises:
         FileNotFoundError: A file, or every image, is missing.
@@ -120,9 +137,13 @@ def read_keypoint_take(
         raise ValueError(
             f"{keypoints} holds boxes only; a fit needs `keypoints_px (F, H, V, 21, 2)`, OpenPose order"
         )
-    pictures = [] if images is None else find_frames(images, found.names)
-    _check_numbers_differ([frame.name for frame in pictures])
-    by_key = {frame_key(frame.name): frame for frame in pictures}
+    if images is None:
+        moments = Moments([], None, False)
+    else:
+        offsets = Timing() if timing is None else Timing(timing.offsets_s)
+        moments = find_moments(images, found, offsets)
+    pictures = [frame.name for frame in moments.frames]
+    _check_numbers_differ(pictures)
     if hands.frames is None and len(pictures) not in (0, len(hands.boxes_px)):
         _log.warning(
             "%s names none of its %d frames, and %s has %d: its images are taken by their numbers from 0000; "
@@ -131,27 +152,51 @@ def read_keypoint_take(
         )
     names = hands.frames or _frame_names(len(hands.boxes_px), pictures)
     hands = align_boxes(hands, names, found.names, keypoints)
-    nothing = (None,) * found.num_views
-    paths = [by_key.get(frame_key(name), FramePaths(name, nothing)) for name in names]
+    by_key = {frame_key(name): row for row, name in enumerate(pictures)}
+    rows = [by_key.get(frame_key(name), -1) for name in names]
     if len(pictures) == len(names) == 1:
-        paths = pictures
-    if pictures and not any(frame in pictures for frame in paths):
+        rows = [0]
+    if pictures and max(rows) < 0:
         raise ValueError(
-            f"{images}: no frame of it ({', '.join(frame.name for frame in pictures[:3])}) is among those of "
-            f"{keypoints} ({', '.join(names[:3])})"
+            f"{images}: no frame of it ({', '.join(pictures[:3])}) is among those of {keypoints} "
+            f"({', '.join(names[:3])})"
         )
-    return make_take(found, paths, hands)
+    paths = PickedFrames(moments.frames, rows, names, found.num_views)
+    return make_take(found, paths, hands, _rate_of_rows(rows, moments))
 
 
-def make_take(rig: Rig, paths: Sequence[FramePaths], hands: HandBoxes) -> Take:
+def make_take(
+    rig: Rig, paths: Sequence[FramePaths], hands: HandBoxes, frames_per_second: float | None = None
+) -> Take:
     """Put a take together; boxes that lie wholly outside their image count as unseen.
+
+    Args:
+        rig: The cameras.
+        paths: The frames.
+        hands: Aligned with them.
+        frames_per_second: None = by the times of `hands`, where it has them.
 
     Raises: ValueError: The name of a frame cannot be that of a folder, or comes twice, if only as a number.
     """
     names = safe_file_names([frame.name for frame in paths], "names of frames")
     _check_numbers_differ(names)
     frames = StoredFrames(paths, without_boxes_outside(hands, rig.size_wh))
-    return Take(rig, hands.hand_side, frames, hands.detector)
+    if frames_per_second is None:
+        frames_per_second = _rate_of_times(hands)
+    return Take(rig, hands.hand_side, frames, hands.detector, frames_per_second)
+
+
+def _rate_of_rows(rows: Sequence[int], moments: Moments) -> float | None:
+    """Return the rate of the frames that key points have of a take: every so many of its own."""
+    steps = np.diff([row for row in rows if row >= 0])
+    if moments.frames_per_second is None or not len(steps) or np.median(steps) <= 0:
+        return moments.frames_per_second
+    return moments.frames_per_second / float(np.median(steps))
+
+
+def _rate_of_times(hands: HandBoxes) -> float | None:
+    steps = np.zeros(0) if hands.time_s is None else np.diff(hands.time_s[np.isfinite(hands.time_s)])
+    return 1 / float(np.median(steps)) if len(steps) else None
 
 
 def in_groups(frames: Iterable[Frame], size: int) -> Iterator[list[Frame]]:
@@ -177,8 +222,8 @@ def _check_numbers_differ(names: Iterable[str]) -> None:
             )
 
 
-def _frame_names(count: int, pictures: list[FramePaths]) -> tuple[str, ...]:
+def _frame_names(count: int, pictures: Sequence[str]) -> tuple[str, ...]:
     """Name frames that the file does not: as those of the images where these are as many, else by number."""
     if len(pictures) == count:
-        return tuple(frame.name for frame in pictures)
+        return tuple(pictures)
     return tuple(f"{index:04d}" for index in range(count))

@@ -1,66 +1,47 @@
 """The stage `write`: what a reconstruction leaves on disk, written as the frames come.
 
 Every file appears whole or not at all. If the stream ends early, by Ctrl-C or an error, what was done is
-written before the exception goes on its way.
+written before the exception goes on its way. Each kind of file has a home of its own in `outputs/`.
 """
 
 import functools
 import json
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from poem_jax.capture.frame import Frame
+from poem_jax.capture.outputs.exports import ANIMATION, export_files, write_exports
+from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
+from poem_jax.capture.outputs.meshes import remove_own_meshes, write_frame_meshes
+from poem_jax.capture.outputs.overlays import Drawn, OverlayVideos, draw_views, write_png
+from poem_jax.capture.outputs.page import PageFrames, is_long, make_gallery
+from poem_jax.capture.outputs.page_frame import page_facts, page_frame
+from poem_jax.capture.outputs.prediction import PredictionFile
 from poem_jax.capture.report import Clock, Report
 from poem_jax.capture.take import Take
-from poem_jax.data.lens import PictureMap, picture_map, project_raw, take_picture
-from poem_jax.geometry.distortion import undistort_pixels
-from poem_jax.geometry.rig import Rig
-from poem_jax.geometry.transforms import rigid, smallest_rotation
-from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS, NUM_VERTICES
-from poem_jax.io.animated_glb import AnimatedGlb
-from poem_jax.io.atomic import whole_file
+from poem_jax.hand.joint_weights import vertex_joint_weights
+from poem_jax.hand.model import HandModel
 from poem_jax.io.file_names import safe_file_name, safe_file_names
-from poem_jax.io.growing_npz import GrowingNpz
-from poem_jax.io.meshes import is_own_mesh, write_mesh
-from poem_jax.typing import Array, Float, Int, UInt8
-from poem_jax.viz.overlay import MeshInView, draw_overlay
-from poem_jax.viz.page import HAND_RGB, PageCamera, PageFrame, write_page
+from poem_jax.io.meshes import is_own_mesh
+from poem_jax.typing import Array, Float, Int
+from poem_jax.viz.page import Caption, write_page
 
-MESH_SUFFIXES = (".glb", ".obj")
-PREDICTION, REPORT, PAGE, ANIMATION = "prediction.npz", "report.json", "index.html", "hands.glb"
-SECONDS_PER_FRAME = 1 / 30
-"""Of the animation: what video cameras take; a capture does not say."""
-PAGE_FRAMES = 120
-"""A take with more frames that hold a hand is thinned out evenly for the page."""
-_LONG_TAKE = 20
-_PAGE_PICTURE_PX = 320
-_PAGE_PICTURE_PX_OF_LONG_TAKES = 200
-
-
-_SHAPES = {
-    "joints_world": (NUM_JOINTS, 3),
-    "vertices_world": (NUM_VERTICES, 3),
-    "root_world": (3,),
-    "pose": (NUM_SKELETON_JOINTS, 3),
-    "shape": (NUM_SHAPES,),
-    "translation": (3,),
-    "joint_sigma_m": (NUM_JOINTS,),
-}
-_POINTS = ("joints_world", "vertices_world", "root_world", "translation")
-_WHERE_KNOWN = ("pose", "shape", "translation", "joint_sigma_m")
-"""Left out of `prediction.npz` where no hand has them."""
+PREDICTION, REPORT, PAGE = "prediction.npz", "report.json", "index.html"
+OVERLAYS = "overlays"
+"""Folder of the overlay videos, apart from a capture's own, should both be in one place."""
 
 _log = logging.getLogger(__name__)
 
 
 def take_files(out: Path) -> list[Path]:
-    """Return the files that belong to a take as a whole."""
-    return [out / name for name in (PREDICTION, REPORT, PAGE, ANIMATION)]
+    """Return the files that belong to a take as a whole, whatever is chosen to be written."""
+    exports = export_files(out, ("right", "left"), frozenset(Format))
+    return [*(out / name for name in (PREDICTION, REPORT, PAGE)), *exports]
 
 
 class Written(NamedTuple):
@@ -93,6 +74,22 @@ class Style(NamedTuple):
     """Whether to write one animated mesh of the take."""
     origin_world: Float[Array, "3"]
     """Where the world in which the frames come has its origin in the capture's world."""
+    hands: Mapping[str, HandModel] | None = None
+    """The hand models by side that poses and meshes are of; None = not known."""
+    formats: frozenset[Format] = DEFAULT_FORMATS
+    """What is written beyond arrays, page, report and overlays."""
+
+    @property
+    def of_take(self) -> frozenset[Format]:
+        """The formats without the animation where there is none to be."""
+        return self.formats if self.animation else self.formats - {Format.GLB}
+
+    def joint_weights(self) -> Float[Array, "vert 21"] | None:
+        """Return how much each joint says about each vertex, None where nothing is known of it."""
+        if self.hands is None:
+            return None
+        hand = self.hands["right"]
+        return vertex_joint_weights(hand.v_template, hand.J_regressor, hand.weights)
 
 
 def write_results(
@@ -147,16 +144,12 @@ class _Writer:
         self.files: list[Path] = []
         self.report = Report(out / REPORT, take)
         self._take, self._out, self._style = take, out, style
-        self._prediction = GrowingNpz(out / PREDICTION)
-        self._names: list[str] = []
-        self._unknown: set[str] = set(_WHERE_KNOWN)
-        self._animation = AnimatedGlb(
-            out / ANIMATION,
-            {name: style.faces[side] for name, side in self._hands()},
-            {name: HAND_RGB[side] for name, side in self._hands()},
-            seconds_per_frame=SECONDS_PER_FRAME,
-            origin=style.origin_world,
-        )
+        self._prediction = PredictionFile(out / PREDICTION, take, style.origin_world)
+        sides = zip(take.hand_names, take.hand_sides, strict=True)
+        self._drawn = {name: Drawn(style.faces[side], side) for name, side in sides}
+        chosen = style.formats & {Format.VIDEO, Format.PNG}
+        self._overlays = chosen or {Format.VIDEO if is_long(take.num_frames) else Format.PNG}
+        self._videos = OverlayVideos([out / OVERLAYS / f"{name}.mp4" for name in take.rig.names])
         self._gallery = make_gallery(take.rig, take.num_frames)
         self._pages = PageFrames()
 
@@ -173,74 +166,73 @@ class _Writer:
         }
         self._write_meshes(folder, vertices)
         self._write_overlays(folder, frame, vertices)
-        self._prediction.append(prediction_entry(frame, self._style.origin_world))
-        self._names.append(frame.name)
-        self._unknown -= {n for n in self._unknown for hand in frame.hands if getattr(hand, n) is not None}
+        self._prediction.add(frame)
         if self.report.solved and self._prediction.is_due():
-            self._write_prediction()
-        if self._style.animation:
-            self._animation.add(vertices)
+            self._prediction.write()
         if vertices:
-            self._pages.offer(
-                functools.partial(page_frame, frame.name, vertices, frame.images, self._gallery)
-            )
+            self._pages.offer(functools.partial(page_frame, frame, self._take, *self._gallery))
 
     def finish(self, clock: Clock, about: Mapping[str, Any]) -> None:
-        """Write what belongs to all frames."""
-        self.files.append(self._write_prediction())
-        if self._style.animation:
-            self.files.append(self._animation.write())
-        elif is_own_mesh(self._out / ANIMATION):
-            (self._out / ANIMATION).unlink()
-        self._write_page()
-        self.files.append(self.report.write(clock.rounded(), about))
+        """Write what belongs to all frames; if a part of it cannot be, the rest is there."""
+        self.files.append(self._prediction.write())
+        exported: Mapping[str, Any] = {}
+        try:
+            self.files += self._videos.finish()
+        finally:
+            try:
+                exported = self._write_exports()
+            finally:
+                self._write_page(about)
+                self.files.append(self.report.write(clock.rounded(), {**about, **exported}))
 
     def close(self) -> None:
         """Let go of what is not needed any more."""
-        for part in (self._prediction, self.report, self._animation):
+        for part in (self._prediction, self.report, self._videos):
             part.close()
-
-    def _write_prediction(self) -> Path:
-        constant = {
-            "frames": self._names,
-            "hand_side": self._take.hand_sides,
-            "cameras": self._take.rig.names,
-        }
-        return self._prediction.write({k: np.array(v) for k, v in constant.items()}, self._unknown)
-
-    def _hands(self) -> Iterable[tuple[str, str]]:
-        return zip(self._take.hand_names, self._take.hand_sides, strict=True)
 
     def _write_meshes(self, folder: Path, vertices: Mapping[str, Array]) -> None:
         """Write the meshes of a frame; remove those of an earlier run that this one does not write."""
-        for name, side in self._hands():
-            for path in (folder / f"{name}{suffix}" for suffix in MESH_SUFFIXES):
-                if self._style.meshes and name in vertices:
-                    in_world = vertices[name] + self._style.origin_world
-                    self.files.append(write_mesh(path, in_world, self._style.faces[side]))
-                elif is_own_mesh(path):
-                    path.unlink()
+        written = vertices if self._style.meshes else {}
+        in_world = {name: mesh + self._style.origin_world for name, mesh in written.items()}
+        faces = {name: hand.faces for name, hand in self._drawn.items()}
+        self.files += write_frame_meshes(folder, in_world, faces)
+        remove_own_meshes(folder, [name for name in faces if name not in written])
 
     def _write_overlays(self, folder: Path, frame: Frame, vertices: Mapping[str, Array]) -> None:
-        rig, sides = self._take.rig, dict(self._hands())
-        for view, image in enumerate(frame.images):
-            if image is None:
-                continue
-            meshes = [
-                MeshInView(
-                    *project_raw(rig, view, mesh), self._style.faces[sides[name]], HAND_RGB[sides[name]]
-                )
-                for name, mesh in vertices.items()
-            ]
-            path = folder / f"overlay_{rig.names[view]}.png"
-            self.files.append(write_png(path, draw_overlay(image, meshes)))
+        if not frame.images:
+            return
+        images = draw_views(frame, self._take.rig, vertices, self._drawn)
+        if Format.VIDEO in self._overlays:
+            self._videos.add(frame.time_s, images)
+        if Format.PNG in self._overlays:
+            for camera, image in zip(self._take.rig.names, images, strict=True):
+                if image is not None:
+                    self.files.append(write_png(folder / f"overlay_{camera}.png", image))
 
-    def _write_page(self) -> None:
+    def _write_exports(self) -> Mapping[str, Any]:
+        """Write the files for other programs; return what the report says of them."""
+        style, take = self._style, self._take
+        exports = write_exports(
+            *(self._out, take, self._prediction, style.hands, style.faces, style.of_take, style.origin_world)
+        )
+        self.files += exports.files
+        if ANIMATION not in {path.name for path in exports.files} and is_own_mesh(self._out / ANIMATION):
+            (self._out / ANIMATION).unlink()
+        for path in export_files(self._out, take.hand_names, frozenset(Format)):
+            if path not in exports.files and path.exists():
+                _log.warning("%s is of an earlier run, and does not belong to these results", path)
+        return exports.about
+
+    def _write_page(self, about: Mapping[str, Any]) -> None:
         """Write the page if that can be done here; a warning says why not. The rest does not need it."""
+        kept, style = self._pages.kept, self._style
+        made = f"engine: {about['engine']}, {time.strftime('%d %B %Y, %H:%M')}"
+        caption = Caption(self._out.resolve().name, made, page_facts(self.report, kept))
+        more = {"caption": caption, "joint_weights": style.joint_weights()}
         try:
-            page = write_page(self._out / PAGE, self._pages.kept, self._gallery.cameras, self._style.faces)
+            page = write_page(self._out / PAGE, kept, self._gallery.cameras, style.faces, **more)
             self.files.append(page)
-        except OSError as error:  # It takes a free port to record a page.
+        except OSError as error:
             _log.warning("the 3D page cannot be written, everything else is: %s", error)
 
     def _say_what_is_lost(self, frame: Frame) -> None:
@@ -250,30 +242,6 @@ class _Writer:
                 _log.warning("frame %s: hand '%s' is left out: %s", frame.name, name, hand.reason)
 
 
-def prediction_entry(frame: Frame, origin_world: Float[Array, "3"]) -> dict[str, Array]:
-    """Return what `prediction.npz` holds of a frame; what was not reconstructed is NaN. Metres, world frame.
-
-    `joints_world (H,21,3)`, `vertices_world (H,778,3)`, `root_world (H,3)`, `pose (H,16,3)`, `shape (H,10)`,
-    `translation (H,3)`, `joint_sigma_m (H,21)`, `reprojection_px (H,V)`, `views_used (H,V)`, `valid (H,)`.
-    Points are float64 where `origin_world`, which is added to them, is not zero; else numbers are float32.
-    """
-    hands = frame.hands
-    entry = {
-        "reprojection_px": np.full((len(hands), frame.boxes_px.shape[1]), np.nan, np.float32),
-        "views_used": np.stack([hand.view_mask for hand in hands]),
-        "valid": np.array([hand.reason is None for hand in hands]),
-    }
-    for name, shape in _SHAPES.items():
-        far = name in _POINTS and origin_world.any()
-        entry[name] = np.full((len(hands), *shape), np.nan, np.float64 if far else np.float32)
-    for name in ("reprojection_px", *_SHAPES):
-        for index, hand in enumerate(hands):
-            value = getattr(hand, name)
-            if value is not None:
-                entry[name][index] = value + origin_world if name in _POINTS else value
-    return entry
-
-
 def frame_folder(out: Path, name: str) -> Path:
     """Return the folder of a frame's own files, which lies in `out` itself.
 
@@ -281,83 +249,11 @@ def frame_folder(out: Path, name: str) -> Path:
         ValueError: The name cannot be that of a folder, belongs to a file of the take, or is a link that
             leads elsewhere.
     """
-    if safe_file_name(name, "a frame's name") in (PREDICTION, REPORT, PAGE, ANIMATION):
-        raise ValueError(f"a frame cannot be called {name!r}: a file of the results has this name")
+    if safe_file_name(name, "a frame's name") in {OVERLAYS, *(path.name for path in take_files(out))}:
+        raise ValueError(f"a frame cannot be called {name!r}: one of the results has this name")
     folder = out / name
     if folder.is_symlink():
         raise ValueError(f"{folder} is a link that leads out of the folder of results: give another --out")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file, and the folder of a frame has this name: give another --out")
     return folder
-
-
-def write_png(path: Path, image: UInt8[Array, "h w 3"]) -> Path:
-    """Write an RGB image."""
-    with whole_file(path) as temporary:
-        ok, data = cv2.imencode(".png", image[..., ::-1])
-        if not ok:
-            raise OSError(f"cannot encode {path} as PNG")
-        temporary.write_bytes(data.tobytes())
-    return path
-
-
-class Gallery(NamedTuple):
-    """The small ideal cameras whose pictures the page shows at the places of a rig's cameras."""
-
-    cameras: list[PageCamera]
-    maps: list[PictureMap]
-
-
-def make_gallery(rig: Rig, num_frames: int | None) -> Gallery:
-    """Prepare the page's pictures; those of a take that is long, or may be (None), are smaller."""
-    short = num_frames is not None and num_frames <= _LONG_TAKE
-    longer = _PAGE_PICTURE_PX if short else _PAGE_PICTURE_PX_OF_LONG_TAKES
-    pairs = [_page_camera(rig, view, longer) for view in range(rig.num_views)]
-    return Gallery([camera for camera, _ in pairs], [where for _, where in pairs])
-
-
-class PageFrames:
-    """The frames of a page, gathered while a take goes by: those with a hand, thinned out evenly."""
-
-    def __init__(self) -> None:
-        self.kept: list[PageFrame] = []
-        self._every = 1
-        self._offered = 0
-
-    def offer(self, make: Callable[[], PageFrame]) -> None:
-        """Count a frame that holds a hand; make and keep it if its turn has come."""
-        if self._offered % self._every == 0:
-            self.kept.append(make())
-        self._offered += 1
-        if len(self.kept) > PAGE_FRAMES:
-            self.kept = self.kept[::2]
-            self._every *= 2
-
-
-def page_frame(
-    name: str,
-    vertices_world: Mapping[str, Float[Array, "vert 3"]],
-    images: Sequence[Array | None],
-    gallery: Gallery,
-) -> PageFrame:
-    """Make a frame of the page: the hands by name, and small undistorted pictures."""
-    views = zip(images, gallery.maps, strict=True)
-    pictures = [None if image is None else take_picture(image, at) for image, at in views]
-    return PageFrame(name, vertices_world, pictures)
-
-
-def _page_camera(rig: Rig, view: int, longer: int) -> tuple[PageCamera, PictureMap]:
-    """Make a pinhole with a central axis that looks at the middle of a photograph, whose own axis may not."""
-    K, dist = rig.K[view], rig.dist[view]
-    width, height = (int(size) for size in rig.size_wh[view])
-    x, y = undistort_pixels(np.array([[width / 2, height / 2]]), K, dist)[0]
-    ray = np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
-    R_cam_from_picture = smallest_rotation(np.array([0.0, 0.0, 1.0]), ray)
-    scale = longer / max(width, height)
-    # Off its axis an image is stretched by the squared length of the ray.
-    focal_px = float(scale * (K[0, 0] + K[1, 1]) / 2 * (ray @ ray))
-    hw = (round(scale * height), round(scale * width))
-    K_picture = np.array([[focal_px, 0, hw[1] / 2], [0, focal_px, hw[0] / 2], [0, 0, 1]])
-    T_picture_from_world = rigid(R_cam_from_picture.T, np.zeros(3)) @ rig.T_cam_from_world[view]
-    where = picture_map(K, dist, K_picture, hw, 1 / scale, R_cam_from_picture)
-    return PageCamera(rig.names[view], T_picture_from_world, focal_px, hw), where

@@ -80,11 +80,12 @@ class Convert:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """File or folder to write."""
     format: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Name of the format to write; without it the one that the ending of OUT says."""
+    """Name of the format to write; without it what the ending of OUT says."""
     unit: Annotated[str | None, tyro.conf.arg(metavar="UNIT")] = None
-    """Unit of the lengths in IN where its format does not say: metre, centimetre, millimetre."""
+    """Unit of the lengths in IN, whatever it says: metre, centimetre, millimetre, inch, or the metres of
+    one unit."""
     image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H")] = None
-    """Width and height of the images where the format does not say."""
+    """Width and height of all images, for formats that do not hold them."""
     debug: Flag = False
     """Show the full traceback of an error."""
 

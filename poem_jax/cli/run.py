@@ -15,9 +15,11 @@ from poem_jax.cli.export_torch import ExportTorch
 from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.inspect import Inspect
+from poem_jax.cli.live import Live
 from poem_jax.cli.messages import set_up_logging
 from poem_jax.cli.pack import Pack
 from poem_jax.cli.reconstruct import Reconstruct
+from poem_jax.cli.retarget import Retarget
 from poem_jax.cli.signals import USAGE_ERROR, UntilReaderLeaves, exit_code, stop_on_signals
 from poem_jax.cli.train import Train
 
@@ -26,7 +28,9 @@ Command = (
     | Reconstruct
     | Fit
     | Detect
+    | Live
     | Calibration
+    | Retarget
     | Inspect
     | Train
     | Eval
@@ -39,6 +43,8 @@ _Commands = (
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
+    | Annotated[Live, tyro.conf.subcommand("live")]
+    | Annotated[Retarget, tyro.conf.subcommand("retarget")]
     | Annotated[Calibration, tyro.conf.subcommand("calibration")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Train, tyro.conf.subcommand("train")]

@@ -1,6 +1,6 @@
 """The folder of a capture: its calibration, and its images, one per camera or one folder per frame.
 
-    DIR/rig.json or DIR/calibration/rig.json
+    DIR/rig.json or DIR/calibration/rig.json, else the calibration of another tool in DIR or DIR/calibration
 
     DIR/<camera>.jpg                    one frame
     DIR/frames/<frame>/<camera>.jpg     a take
@@ -16,15 +16,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from poem_jax.calibration.rig_json import read_rig
+from poem_jax.calibration.read_calibration import find_calibrations, read_calibration
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import name_key, safe_file_names
+from poem_jax.io.video import ImageSource
 
 RIG_FILES = ("rig.json", "calibration/rig.json")
 SUFFIXES = (".jpg", ".jpeg", ".png")
 SINGLE_FRAME = "0000"
 """Name of the only frame of a capture without `frames/`."""
-_SYSTEM_PREFIXES = (".", "@", "#", "$", "__")
+SYSTEM_PREFIXES = (".", "@", "#", "$", "__")
 """Of folders that are not the user's: hidden, made by a network disk, an archive or an interpreter."""
 
 
@@ -32,8 +33,10 @@ class FramePaths(NamedTuple):
     """Where the images of one moment lie."""
 
     name: str
-    images: tuple[Path | None, ...]
-    """One per camera in the rig's order; None = there is no such file."""
+    images: tuple[ImageSource | None, ...]
+    """One per camera in the rig's order; None = there is none."""
+    time_s: float | None = None
+    """Seconds since the take began; None = only the order is known."""
 
 
 def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[FramePaths]:
@@ -48,40 +51,58 @@ def find_frames(folder: str | os.PathLike, camera_names: Sequence[str]) -> list[
         raise FileNotFoundError(f"no capture folder at {folder}")
     if (folder / "frames").is_dir():
         places = [place for place in (folder / "frames").iterdir() if place.is_dir()]
-        places = sorted((p for p in places if not p.name.startswith(_SYSTEM_PREFIXES)), key=_natural)
+        places = sorted((p for p in places if not p.name.startswith(SYSTEM_PREFIXES)), key=natural_order)
         names = safe_file_names([place.name for place in places], f"{folder / 'frames'}: the frames' names")
         frames = [
-            FramePaths(name, _images(place, camera_names)) for name, place in zip(names, places, strict=True)
+            FramePaths(name, images_of_cameras(place, camera_names))
+            for name, place in zip(names, places, strict=True)
         ]
     else:
-        frames = [FramePaths(SINGLE_FRAME, _images(folder, camera_names))]
+        frames = [FramePaths(SINGLE_FRAME, images_of_cameras(folder, camera_names))]
     if not any(path for frame in frames for path in frame.images):
         raise FileNotFoundError(
             f"no image of the rig's cameras in {folder}: expected {camera_names[0]}.jpg (or .png), ..., or "
-            f"frames/<frame>/{camera_names[0]}.jpg; found {_found(folder)}"
+            f"frames/<frame>/{camera_names[0]}.jpg, or for each camera a video ({camera_names[0]}.mp4) or a "
+            f"folder of images; found {_found(folder)}"
         )
     return frames
 
 
 def find_rig(folder: str | os.PathLike, rig: str | os.PathLike | None = None) -> Rig:
-    """Read the rig of a capture: the given file, else `rig.json` or `calibration/rig.json` in the folder.
+    """Read the rig of a capture: the given calibration, of any kind that is read, else what is in the folder.
 
-    Raises: FileNotFoundError, ValueError: as `read_rig`.
+    Raises: FileNotFoundError, ValueError: as `read_calibration` and `find_rig_file`.
     """
-    return read_rig(find_rig_file(folder) if rig is None else rig)
+    return read_calibration(find_rig_file(folder) if rig is None else rig)
 
 
 def find_rig_file(folder: str | os.PathLike) -> Path:
-    """Return the rig's file in a capture's folder.
+    """Return the rig's file in a capture's folder: `rig.json`, else the one calibration of another tool.
 
-    Raises: FileNotFoundError: there is none.
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: there are several, of which none is `rig.json`.
     """
-    places = [Path(folder) / name for name in RIG_FILES]
+    folder = Path(folder)
+    places = [folder / name for name in RIG_FILES]
     found = next((place for place in places if place.is_file()), None)
-    if found is None:
+    if found is not None:
+        return found
+    others = [
+        files[0]
+        for place in (folder, folder / "calibration")
+        if place.is_dir()
+        for files in find_calibrations(place)
+    ]
+    if len(others) > 1:
+        names = ", ".join(str(path.relative_to(folder)) for path in others[:8])
+        raise ValueError(f"{folder} holds several calibrations, {names}: say which by --rig FILE")
+    if not others:
         looked = " or ".join(map(str, places))
-        raise FileNotFoundError(f"no {looked}: no rig: pass --rig FILE, or put it there")
-    return found
+        raise FileNotFoundError(
+            f"no {looked}, nor a calibration of another tool there: no rig: pass --rig FILE, or put it there"
+        )
+    return others[0]
 
 
 def frame_key(name: str) -> str | int:
@@ -96,8 +117,11 @@ def hand_names(sides: tuple[str, ...]) -> tuple[str, ...]:
     )
 
 
-def _images(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:
-    """Find every camera's image; a name's accented letters may be written in either form of Unicode."""
+def images_of_cameras(place: Path, camera_names: Sequence[str]) -> tuple[Path | None, ...]:
+    """Find every camera's image; a name's accented letters may be written in either form of Unicode.
+
+    Raises: ValueError: a camera has two.
+    """
     found: dict[str, list[Path]] = {}
     for path in sorted(place.iterdir()):
         if path.suffix.lower() in SUFFIXES:
@@ -116,5 +140,6 @@ def _found(folder: Path) -> str:
     return ", ".join(shown[:3]) + (", ..." if len(shown) > 3 else "") or "no image"
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """Return what sorts `frame_10` behind `frame_2`."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

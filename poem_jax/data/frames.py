@@ -15,6 +15,7 @@ import numpy as np
 
 from poem_jax.data.frame_agreement import disagreements
 from poem_jax.geometry.camera_checks import ROTATION_TOLERANCE, has_form_of_intrinsics, rotation_error
+from poem_jax.geometry.distortion import TERM_COUNTS
 from poem_jax.typing import Array, Float, Int
 
 HAND_EXTENT_M = (0.04, 0.4)
@@ -77,7 +78,7 @@ class MultiViewFrame(NamedTuple):
     must still be turned left to right about the column u = mirror_px, u' = 2 mirror_px - u, where
     mirror_px = cx keeps K."""
     dist: Float[Array, "view term"] | None = None
-    """Lens of the stored images, the 5 or 8 terms of `geometry.distortion`, as calibrated (not mirrored);
+    """Lens of the stored images, the terms of `geometry.distortion`, as calibrated (not mirrored);
     None: they have no distortion. K, key points and boxes are those of the ideal image that the same K would
     see without it: crops are sampled through the lens (`data/lens.py`)."""
 
@@ -161,8 +162,9 @@ def _problems(frame: MultiViewFrame) -> Iterator[str]:
             yield f"`{name}` is not finite in {_views(frame, bad)}"
     if frame.dist is not None:
         terms = np.asarray(frame.dist, np.float64)
-        if terms.shape not in ((views, 5), (views, 8)):
-            yield f"`dist` must have shape {(views, 5)} or {(views, 8)} for {views} images; got {terms.shape}"
+        if terms.ndim != 2 or terms.shape[0] != views or terms.shape[1] not in TERM_COUNTS:
+            counts = ", ".join(map(str, TERM_COUNTS))
+            yield f"`dist` must have a row of {counts} terms for each of {views} images; got {terms.shape}"
         elif not np.isfinite(terms).all():
             yield f"`dist` is not finite in {_views(frame, ~np.isfinite(terms).all(-1))}"
     if len(frame.view_names) != views:

@@ -16,13 +16,14 @@ from poem_jax.geometry.cameras import (
     pixels_from_normalised,
     resize_intrinsics,
 )
-from poem_jax.geometry.distortion import distort, undistort
+from poem_jax.geometry.distortion import distort, distort_pixels, undistort, undistort_pixels
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.typing import Array, Bool, Float, UInt8
 
 _MAX_SUPERSAMPLE = 8
 _ROUND_TRIP_TOLERANCE = 1e-3
+_MISSED_PX = 0.5
 _NEAR = 1e-3
 _FAR_OUTSIDE = 1e3
 _NODE_STEP = 4
@@ -36,7 +37,8 @@ def project_raw(
 
     Returns:
         Raw pixels, and the points in the camera's frame. Pixels are NaN for points behind the camera and for
-        those so far off the axis that the distortion polynomial turns back: the lens does not show them.
+        those so far off the axis that the distortion polynomial turns back, or beyond `WIDEST_ANGLE` of a
+        fisheye: the lens does not show them.
     """
     K, dist = rig.K[view], rig.dist[view]
     points_cam = transform_points(rig.T_cam_from_world[view], np.asarray(points_world, np.float64))
@@ -45,6 +47,15 @@ def project_raw(
     bent = distort(rays, dist)
     shown = in_front & _shows(dist, rays, bent)
     return np.where(shown[:, None], pixels_from_normalised(K, bent), np.nan), points_cam
+
+
+def ideal_pixels(
+    uv_px: Float[Array, "point 2"], K: Float[Array, "3 3"], dist: Float[Array, " term"]
+) -> Float[Array, "point 2"]:
+    """Return where the same K without a lens sees pixels of a photograph; NaN where its lens has no ray."""
+    ideal = undistort_pixels(uv_px, K, dist)
+    missed = np.linalg.norm(distort_pixels(ideal, K, dist) - uv_px, axis=-1, keepdims=True)
+    return np.where(missed < _MISSED_PX, ideal, np.nan)
 
 
 def _shows(
@@ -78,7 +89,7 @@ def picture_map(
 
     Args:
         K: Intrinsics of the photographs.
-        dist: Their distortion, the 5 or 8 terms of `geometry.distortion`.
+        dist: Their lens, the terms of `geometry.distortion`.
         K_picture: Intrinsics of the picture wanted.
         hw: Size of the picture wanted.
         step: Raw pixels per picture pixel; above 1 several samples per pixel are averaged, as otherwise

@@ -66,32 +66,73 @@ def find_hands(images: Sequence[Array], *, max_hands: int = 2) -> list[list[Dete
     return _look(images, _regions_of_palms(images, max_hands))
 
 
-class HandTracker:
-    """Finds the hands in the frames of a video of one camera.
+class HandTrackers:
+    """Finds the hands in the frames of several cameras' videos; the cameras' pictures are worked on together.
 
-    The hands of the last frame say where to look; the palm network runs while fewer than `max_hands` are
-    followed, and every tenth frame, lest a face be followed for ever.
+    The hands of a camera's last frame say where to look; the palm network runs while fewer than `max_hands`
+    are followed, and every tenth frame, lest a face be followed for ever.
     """
 
-    def __init__(self, max_hands: int = 2) -> None:
+    def __init__(self, num_cameras: int, max_hands: int = 2) -> None:
         self._max_hands = max_hands
-        self._last: list[Region] = []
-        self._turn = 0
+        self._last: list[list[Region]] = [[] for _ in range(num_cameras)]
+        self._turns = [0] * num_cameras
+
+    def find_hands(self, cameras: Sequence[int], images: Sequence[Array]) -> list[list[DetectedHand]]:
+        """Find the hands in the next frames of some of the cameras.
+
+        Args:
+            cameras: Their numbers, each once.
+            images: One of each; as for `find_hands`, errors too.
+
+        Returns: the hands of every image.
+        """
+        _check(images, self._max_hands)
+        hands = _look(images, [self._last[camera] for camera in cameras])
+        again = []
+        for place, camera in enumerate(cameras):
+            self._turns[camera] += 1
+            if len(hands[place]) < self._max_hands or self._turns[camera] % _LOOK_AGAIN == 0:
+                again.append(place)
+        if again:
+            self._look_again(again, images, hands)
+        for place, camera in enumerate(cameras):
+            self._last[camera] = _without_doubles([region_of_hand(h.keypoints_px) for h in hands[place]])
+        return hands
+
+    def _look_again(
+        self, places: Sequence[int], images: Sequence[Array], hands: list[list[DetectedHand]]
+    ) -> None:
+        """Look for palms in some of the images, where no hand is followed, and add what they give."""
+        chosen = [images[place] for place in places]
+        new = []
+        for place, palms in zip(places, _regions_of_palms(chosen, self._max_hands), strict=True):
+            followed = [region_of_hand(hand.keypoints_px) for hand in hands[place]]
+            new.append(
+                [region for region in palms if all(overlap(region, one) <= _SAME_PLACE for one in followed)]
+            )
+        for place, more in zip(places, _look(chosen, new), strict=True):
+            # A face that was taken for a hand gives its place to a surer one.
+            surest = sorted([*hands[place], *more], key=lambda hand: -hand.score)
+            hands[place] = surest[: self._max_hands]
+
+
+class HandTracker:
+    """Finds the hands in the frames of a video of one camera, as `HandTrackers` does."""
+
+    def __init__(self, max_hands: int = 2) -> None:
+        self._trackers = HandTrackers(1, max_hands)
 
     def find_hands(self, image: Array) -> list[DetectedHand]:
         """Find the hands in the next frame; arguments and errors as `find_hands`."""
-        _check([image], self._max_hands)
-        (hands,) = _look([image], [self._last])
-        self._turn += 1
-        if len(hands) < self._max_hands or self._turn % _LOOK_AGAIN == 0:
-            (palms,) = _regions_of_palms([image], self._max_hands)
-            followed = [region_of_hand(hand.keypoints_px) for hand in hands]
-            new = [region for region in palms if all(overlap(region, one) <= _SAME_PLACE for one in followed)]
-            (more,) = _look([image], [new])
-            # A face that was taken for a hand gives its place to a surer one.
-            hands = sorted([*hands, *more], key=lambda hand: -hand.score)[: self._max_hands]
-        self._last = _without_doubles([region_of_hand(hand.keypoints_px) for hand in hands])
+        (hands,) = self._trackers.find_hands([0], [image])
         return hands
+
+
+def compile_programs() -> None:
+    """Compile all that `find_hands` and the trackers may need, so that no image waits for it."""
+    for program in (_palm_program(), _landmark_program()):
+        program.compile()
 
 
 def _check(images: Sequence[Any], max_hands: int) -> None:
@@ -172,6 +213,12 @@ class _Program:
         else:
             parts = [run(group) for group in groups]
         return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+
+    def compile(self) -> None:
+        """Compile it for one group of pictures, and for several side by side."""
+        on_cpu = jax.default_backend() == "cpu"
+        for beside_others in (False, True) if on_cpu else (False,):
+            self._program(1 if on_cpu else _BATCH, beside_others)
 
     def _program(self, number: int, beside_others: bool) -> Any:
         """Return the compiled program, that takes one thread where several run side by side."""

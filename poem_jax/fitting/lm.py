@@ -32,7 +32,6 @@ from poem_jax.fitting.observations import Observations, point_information
 from poem_jax.fitting.residuals import (
     LIMIT_SIGMA,
     MIN_PRIOR_SIGMA,
-    anatomical_angles,
     geman_mcclure,
     geman_mcclure_weight,
     joint_limits,
@@ -42,6 +41,7 @@ from poem_jax.fitting.residuals import (
     shape_prior,
 )
 from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, rotation_from_axis_angle, transpose
+from poem_jax.hand.joint_limits import anatomical_angles
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, NUM_SKELETON_JOINTS
 from poem_jax.typing import Array, Bool, Float
 

@@ -40,13 +40,6 @@ def joints_3d(
     return (joints_world - target_world) / sigma_m[..., None]
 
 
-def anatomical_angles(
-    pose: Float[Array, "*batch 16 3"], axes: Float[Array, "15 3 3"]
-) -> Float[Array, "*batch 15 3"]:
-    """Return flexion, abduction and twist of every bending joint; linear in the axis-angle `pose`."""
-    return jnp.sum(axes * pose[..., 1:, None, :], axis=-1)
-
-
 def joint_limits(
     angles: Float[Array, "*batch 15 3"], limits: Float[Array, "15 3 2"], sigma: float = LIMIT_SIGMA
 ) -> Float[Array, "*batch 15 3"]:

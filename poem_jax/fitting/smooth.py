@@ -10,8 +10,9 @@ the right sides,
     x_f = m_f + G_f W_f x_{f+1},                C_f = G_f + G_f W_f C_{f+1} W_f G_f^T,
 
 C_f the blocks of the inverse: the covariance of frame f. Numbers are in units of the walk of `SmoothConfig`.
-A step of the first pass that is longer than this walk and its own uncertainty explain - a fast hand, a gap
-between frames - is held only as tightly as it is long. Steps of the solver are Levenberg-Marquardt's: kept
+The variance of the walk grows with the time between frames, which may be spaced unevenly. A step of the first
+pass that is longer than this walk and its own uncertainty explain - a fast hand - is held only as tightly as
+it is long. Steps of the solver are Levenberg-Marquardt's: kept
 where they lower the cost of the whole take. The shape stays as the first pass left it. Frames without
 observations are bridged, and tell nothing.
 """
@@ -46,12 +47,15 @@ _MAX_DAMPING = 1e4
 
 @dataclass(frozen=True)
 class SmoothConfig:
-    """How far a hand moves from one frame to the next at rest, one standard deviation."""
+    """How far a hand moves at rest within a given time, one standard deviation; over longer times as a random
+    walk goes."""
 
     sigma_angle: float = 0.05
     """Radians."""
     sigma_m: float = 0.01
     """Metres."""
+    seconds: float = 1 / 30
+    """The time in which it goes so far; also from frame to frame where frames have no times."""
     iterations: int = 5
 
 
@@ -120,15 +124,30 @@ class Motion(NamedTuple):
     sigma: Float[Array, "51"]
     """The walk at rest: radians, metres."""
     precision: Float[Array, "step 51"]
-    """Of every step, in units of this walk: 1 at rest, less where the hand moves fast."""
+    """Of every step, in units of this walk: at rest `SmoothConfig.seconds` by the time between the frames,
+    less where the hand moves fast."""
 
 
 def smooth(
-    model: KeypointModel, take: TakeObservations, state: TakeState, config: LMConfig, walk: SmoothConfig
+    model: KeypointModel,
+    take: TakeObservations,
+    state: TakeState,
+    config: LMConfig,
+    walk: SmoothConfig,
+    steps_s: Float[Array, "step"],
 ) -> tuple[TakeState, Motion]:
-    """Return the take's most probable motion near `state`, the shape unchanged, and how it was held."""
+    """Return the take's most probable motion near `state`, the shape unchanged, and how it was held.
+
+    Args:
+        model: The hand.
+        take: What is seen of it.
+        state: The first pass.
+        config: Of the first pass.
+        walk: How the hand moves at rest.
+        steps_s: The time from each frame to the next, seconds.
+    """
     state = _bridged(take, state)
-    motion = motion_of(model, take, state, config, walk)
+    motion = motion_of(model, take, state, config, walk, steps_s)
 
     def step(carry: tuple[TakeState, Array], _: None) -> tuple[tuple[TakeState, Array], None]:
         state, damping = carry
@@ -146,13 +165,19 @@ def smooth(
 
 
 def motion_of(
-    model: KeypointModel, take: TakeObservations, state: TakeState, config: LMConfig, walk: SmoothConfig
+    model: KeypointModel,
+    take: TakeObservations,
+    state: TakeState,
+    config: LMConfig,
+    walk: SmoothConfig,
+    steps_s: Float[Array, "step"],
 ) -> Motion:
     """Return how tightly to hold each step of `state`, a first pass: by its length, less its noise.
 
     With C the covariance of a frame and P the prior's part of C^-1, the first pass shows the share
     r = 1 - diag(C P) of a motion, and its noise is diag(C - C P C). Turns and place of a step are each one
-    sample of the walk's variance, sum(step^2 - noise) / sum(r^2), never taken below that of `walk`.
+    sample of the walk's variance, sum(step^2 - noise) / sum(r^2), never taken below that of `walk` over the
+    time between the frames.
     """
     place = jnp.arange(STATE_SIZE) >= POSE_SIZE
     equations = _equations(model, take, state, config)
@@ -168,7 +193,8 @@ def motion_of(
         jnp.sum(moved[:, part], -1, keepdims=True) / jnp.sum(shown[:, part], -1, keepdims=True)
         for part in (slice(0, POSE_SIZE), slice(POSE_SIZE, None))
     )
-    return Motion(sigma, 1 / jnp.maximum(jnp.where(place, moves, turns), 1))
+    at_rest = (steps_s / walk.seconds).astype(sigma.dtype)[:, None]
+    return Motion(sigma, 1 / jnp.maximum(jnp.where(place, moves, turns), at_rest))
 
 
 def take_cost(

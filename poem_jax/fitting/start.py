@@ -9,17 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from poem_jax.fitting.kinematics import KeypointModel, joints_of, pose_keypoints
-from poem_jax.fitting.residuals import anatomical_angles
 from poem_jax.geometry.alignment import apply_similarity, procrustes
-from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, smallest_rotation, transpose
-from poem_jax.hand.topology import (
-    NUM_JOINTS,
-    NUM_SKELETON_JOINTS,
-    PALM_JOINTS,
-    SKELETON_FINGERS,
-    SKELETON_FROM_OPENPOSE,
-    WRIST,
-)
+from poem_jax.geometry.transforms import axis_angle_from_rotation, matmul, transpose
+from poem_jax.hand.bones import bone_rotations
+from poem_jax.hand.joint_limits import anatomical_angles
+from poem_jax.hand.topology import NUM_JOINTS, NUM_SKELETON_JOINTS, PALM_JOINTS, WRIST
 from poem_jax.typing import Array, Bool, Float
 
 MIN_JOINTS = 3
@@ -27,7 +21,6 @@ MIN_JOINTS = 3
 MIN_WIDTH_M = 0.005
 """And how far, root mean square, these must lie from one line: a hand could turn about it."""
 
-_SKELETON = np.array(SKELETON_FROM_OPENPOSE, np.int32)
 _PALM = np.isin(np.arange(NUM_JOINTS), PALM_JOINTS)
 _WRIST_OR_THUMB_BASE = np.isin(np.arange(NUM_JOINTS), PALM_JOINTS[:2])
 
@@ -75,30 +68,13 @@ def closed_form_pose(
     used = jnp.where(enough[..., None], palm, valid)
     fit = procrustes(rest, joints_world, with_scale=False, mask=used)
     joints = jnp.where(valid[..., None], joints_world, apply_similarity(fit, rest))
-    pose = axis_angle_from_rotation(_local_turns(fit.R, rest, joints))
+    pose = axis_angle_from_rotation(bone_rotations(fit.R, rest, joints))
     wrist = joints[..., WRIST, :]
     if model.offsets is not None:
         # The wrist's key point lies beside the wrist, and turns with the palm.
         beside = rest[..., WRIST, :] - joints_of(model, posed)[..., WRIST, :]
         wrist = wrist - matmul(fit.R, beside[..., None])[..., 0]
     return _within_limits(model, pose), wrist
-
-
-def _local_turns(
-    palm: Float[Array, "*batch 3 3"], rest: Float[Array, "*batch 21 3"], joints: Float[Array, "*batch 21 3"]
-) -> Float[Array, "*batch 16 3 3"]:
-    """Return every joint's rotation relative to its parent, MANO order."""
-    turn = jnp.broadcast_to(palm[..., None, :, :], (*palm.shape[:-2], len(SKELETON_FINGERS), 3, 3))
-    locals_ = []
-    for skeleton_joints in np.array(SKELETON_FINGERS).T:
-        start = _SKELETON[skeleton_joints]
-        expected = rest[..., start + 1, :] - rest[..., start, :]
-        observed = joints[..., start + 1, :] - joints[..., start, :]
-        local = smallest_rotation(expected, matmul(transpose(turn), observed[..., None])[..., 0])
-        turn = matmul(turn, local)
-        locals_.append(local)
-    fingers = jnp.stack(locals_, -3).reshape(*palm.shape[:-2], -1, 3, 3)
-    return jnp.concatenate([palm[..., None, :, :], fingers], -3)
 
 
 def _within_limits(model: KeypointModel, pose: Float[Array, "*batch 16 3"]) -> Float[Array, "*batch 16 3"]:

@@ -20,7 +20,7 @@ from jax.core import Tracer
 
 from poem_jax.fitting.adam import ADAM_300, AdamParameters, AdamRecipe, adam_fit, released_start
 from poem_jax.fitting.anatomy_loss import rotations_from_raw_quaternions
-from poem_jax.fitting.kinematics import KeypointModel, pose_keypoints, rest_wrist
+from poem_jax.fitting.kinematics import KeypointModel, joints_of, pose_keypoints, rest_wrist
 from poem_jax.fitting.lm import (
     LMConfig,
     ShapeMode,
@@ -47,7 +47,7 @@ from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.topology import NUM_JOINTS, NUM_SHAPES, WRIST
 from poem_jax.typing import Array, Bool, Float
 
-_PLACES = ("translation", "joints", "vertices", "keypoints")
+_PLACES = ("translation", "joints", "vertices", "keypoints", "alone")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class FitConfig:
 class FitResult(NamedTuple):
     """A hand over a take. World frame, metres; where not `valid`, finite numbers that mean nothing.
 
-    Of a far world, `translation`, `joints`, `vertices` and `keypoints` are NumPy arrays in float64.
+    Of a far world, `translation`, `joints`, `vertices`, `keypoints` and `alone` are NumPy arrays in float64.
     """
 
     pose: Float[Array, "frame 16 3"]
@@ -96,6 +96,8 @@ class FitResult(NamedTuple):
     (robust), pose prior and joint limits; NaN where not `valid`. A hand of the wrong side costs more."""
     keypoints: Float[Array, "frame 21 3"]
     """Where the detector should see the joints: `joints` moved by the offsets of the model, if it has any."""
+    alone: Float[Array, "frame 21 3"]
+    """The joints as each frame by itself has them: those of the first pass, where there is a second."""
 
 
 def fit_take(
@@ -103,6 +105,7 @@ def fit_take(
     observations: Observations,
     shape: Float[Array, "..."] | None = None,
     config: FitConfig = FitConfig(),
+    time_s: Float[Array, "frame"] | None = None,
 ) -> FitResult:
     """Fit one hand to all frames of a take.
 
@@ -116,28 +119,38 @@ def fit_take(
         shape: the known shape (10,) or (frame, 10); needed by, and only used in, `ShapeMode.GIVEN`.
         config: static under `jax.jit`; its `noise` is that of 1280 x 720 images unless given:
             `FitConfig(noise=KeypointNoise.of_images(size_wh))`.
+        time_s: when each frame was taken, seconds, later and later; for the second pass alone. None = frames
+            `SmoothConfig.seconds` apart.
 
     Raises:
-        ValueError: fewer than two views; key points, cameras and shape that do not belong together; a far
-            world whose extrinsics are not float64.
+        ValueError: fewer than two views; key points, cameras, shape and times that do not belong together; a
+            far world whose extrinsics are not float64.
     """
     _check(observations, shape, config.lm.shape_mode is ShapeMode.GIVEN)
+    steps_s = _steps_s(time_s, len(observations.uv_px), config)
     near, origin = _near_world(model, observations)
-    return _move_back(_fit_take(model, near, shape, config), origin)
+    return _move_back(_fit_take(model, near, shape, config, steps_s), origin)
 
 
 @partial(jax.jit, static_argnames="config")
 def _fit_take(
-    model: KeypointModel, observations: Observations, shape: Array | None, config: FitConfig
+    model: KeypointModel,
+    observations: Observations,
+    shape: Array | None,
+    config: FitConfig,
+    steps_s: Array | None,
 ) -> FitResult:
     take, points = _observe(observations, config.noise)
     state = solve(model, take, _start(model, points, take, shape), config.lm)
+    alone = None
     if config.smooth is None:
         sigma = joint_sigma(model, take, state, config.lm)
     else:
-        state, motion = smooth(model, take, state, config.lm, config.smooth)
+        alone = _joints(model, state)
+        state, motion = smooth(model, take, state, config.lm, config.smooth, steps_s)
         sigma = smoothed_sigma(model, take, state, config.lm, motion)
-    return _result(model, observations, take, state, sigma, points.sigma_px, config.lm)
+    result = _result(model, observations, take, state, sigma, points.sigma_px, config.lm)
+    return result if alone is None else result._replace(alone=alone)
 
 
 def fit_take_adam(
@@ -242,6 +255,27 @@ def _check(observations: Observations, shape: Array | None, given: bool) -> None
         raise ValueError(f"`shape` must have shape (10,) or ({frames}, 10); got {shape.shape}")
 
 
+def _steps_s(time_s: Array | None, frames: int, config: FitConfig) -> Array | None:
+    """Return the time from each frame to the next, subtracted before it is rounded; None = not needed."""
+    if config.smooth is None:
+        return None
+    if time_s is None:
+        return np.full(frames - 1, config.smooth.seconds, np.float32)
+    if time_s.shape != (frames,):
+        raise ValueError(f"`time_s` must have shape ({frames},), one moment a frame; got {time_s.shape}")
+    if isinstance(time_s, Tracer):
+        return jnp.diff(time_s)
+    steps = np.diff(np.asarray(time_s, np.float64))
+    wrong = np.flatnonzero(~(steps > 0))
+    if wrong.size:
+        first = wrong[0]
+        raise ValueError(
+            "`time_s` must be seconds that grow from frame to frame; got "
+            f"{time_s[first]} and {time_s[first + 1]} of frames {first} and {first + 1}"
+        )
+    return steps.astype(np.float32)
+
+
 def _check_silhouettes(silhouettes: SilhouetteTarget | None, frames_and_views: tuple[int, int]) -> None:
     if silhouettes is None:
         return
@@ -316,7 +350,14 @@ def _result(
         sigma_px,
         jnp.where(valid, frame_cost(model, take, state, config.robust_sigmas, config), jnp.nan),
         keypoints,
+        mesh.joints,
     )
+
+
+def _joints(model: KeypointModel, state: TakeState) -> Float[Array, "frame 21 3"]:
+    """Return the joints of a state, without its surface."""
+    posed = pose_keypoints(model, state.pose, state.shape)
+    return joints_of(model, posed) + state.wrist[:, None]
 
 
 def _keypoints(model: KeypointModel, state: TakeState, joints: Float[Array, "frame 21 3"]) -> Array:

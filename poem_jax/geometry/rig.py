@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from poem_jax.geometry.cameras import Cameras
-from poem_jax.typing import Array, Float, Int
+from poem_jax.geometry.distortion import is_fisheye
+from poem_jax.typing import Array, Bool, Float, Int
 
 HALF_PIXEL = 0.5
 """From coordinates that count from the centre of the top-left pixel, as OpenCV and detectors do, to those in
@@ -27,7 +28,7 @@ class Rig(NamedTuple):
     K: Float[Array, "view 3 3"]
     """Intrinsics of the raw images."""
     dist: Float[Array, "view term"]
-    """The 5 or 8 terms of `geometry.distortion`; zeros for undistorted images."""
+    """The lenses, as `geometry.distortion` describes; zeros for undistorted images."""
     T_cam_from_world: Float[Array, "view 4 4"]
 
     @property
@@ -39,6 +40,11 @@ class Rig(NamedTuple):
     def cameras(self) -> Cameras:
         """The cameras of the undistorted, uncropped images."""
         return Cameras(self.K, self.T_cam_from_world)
+
+    @property
+    def fisheye(self) -> Bool[Array, " view"]:
+        """Which cameras have a fisheye; the others are pinholes with or without distortion."""
+        return is_fisheye(self.dist)
 
     def select(self, names: Sequence[str]) -> "Rig":
         """Return the rig of the named cameras, in the given order.

@@ -21,7 +21,7 @@ from poem_jax.hand.topology import (
     SKELETON_FINGERS,
     TIP_VERTICES_LAYER,
 )
-from poem_jax.typing import Float
+from poem_jax.typing import Array, Float
 
 NUM_BENDING_JOINTS = NUM_SKELETON_JOINTS - 1
 ANGLE_NAMES = ("flexion", "abduction", "twist")
@@ -77,3 +77,10 @@ def anatomical_axes(hand: HandModel) -> Float[np.ndarray, "15 3 3"]:
     hand = HandModel(*(np.asarray(array) for array in hand))
     axes = axes_of_fingers(resting_fingers(mirror(hand) if hand.is_left else hand))
     return axes * _MIRROR_AXES if hand.is_left else axes
+
+
+def anatomical_angles(
+    pose: Float[Array, "*batch 16 3"], axes: Float[Array, "15 3 3"]
+) -> Float[Array, "*batch 15 3"]:
+    """Return flexion, abduction and twist of every bending joint; linear in the axis-angle `pose`."""
+    return (axes * pose[..., 1:, None, :]).sum(-1)

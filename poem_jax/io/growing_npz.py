@@ -68,6 +68,12 @@ class GrowingNpz:
         self._due = now + max(FLUSH_SECONDS, (now - start) / _MAX_SHARE)
         return self.path
 
+    def grown(self, name: str) -> Array:
+        """Return the entries so far of an array, (entry, ...), read from the disk as they are used."""
+        shape, dtype = self._kinds[name]
+        self._grown[name].flush()
+        return np.memmap(self._grown[name], dtype, "r", shape=(self._count, *shape))
+
     def close(self) -> None:
         """Let the gathered entries go; the file stays."""
         self._files.close()

@@ -28,29 +28,41 @@ def read_yaml(path: str | Path, *, what: str = "YAML file") -> Any:
     size = path.stat().st_size
     if size > MAX_YAML_BYTES:
         raise ValueError(f"{path} is no {what}: it has {size} bytes, of at most {MAX_YAML_BYTES}")
-    text = path.read_bytes()
+    return parse_yaml(path.read_bytes(), str(path))
+
+
+def parse_yaml(text: bytes, source: str, loader: Any = None) -> Any:
+    """Parse one YAML document; errors as in `read_yaml`, with `source` as the name of the file.
+
+    Args:
+        text: The document.
+        source: Its file.
+        loader: A safe loader that knows more tags; None = plain values alone.
+    """
     try:
-        _check_events(text, path)
-        return yaml.load(text, _LOADER)
-    except (yaml.YAMLError, UnicodeError, RecursionError) as error:
-        raise ValueError(f"{path} cannot be read as YAML: {str(error)[:300]}") from error
+        _check_events(text, source)
+        return yaml.load(text, loader or _LOADER)
+    except (yaml.YAMLError, UnicodeError, RecursionError, ValueError) as error:
+        if str(error).startswith(source):
+            raise
+        raise ValueError(f"{source} cannot be read as YAML: {' '.join(str(error).split())[:300]}") from error
 
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """libyaml's where PyYAML was built with it: ten times as fast."""
 
 
-def _check_events(text: bytes, path: Path) -> None:
+def _check_events(text: bytes, source: str) -> None:
     """Walk over the document before anything is built of it: builders recurse as deep as it nests."""
     depth = 0
     for event in yaml.parse(text, _LOADER):
         if isinstance(event, yaml.AliasEvent):
             raise ValueError(
-                f"{path} uses YAML aliases (*name), which no data set needs and which are refused"
+                f"{source} uses YAML aliases (*name), which no data set needs and which are refused"
             )
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         if depth > _MAX_DEPTH:
-            raise ValueError(f"{path} nests too deeply: over {_MAX_DEPTH} lists and maps within each other")
+            raise ValueError(f"{source} nests too deeply: over {_MAX_DEPTH} lists and maps within each other")

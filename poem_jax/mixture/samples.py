@@ -41,6 +41,8 @@ class Drawn(NamedTuple):
     sample: MultiViewBatch
     """Without batch axis."""
     part: int
+    index: int
+    """Of the sample in its part."""
     skipped: tuple[Skipped, ...] = ()
 
 
@@ -73,6 +75,10 @@ class Samples(Protocol):
 
         Raises: CorruptSampleError
         """
+        ...
+
+    def key(self, index: int) -> str:
+        """Return by what the part's user knows a sample."""
         ...
 
     def fingerprint(self) -> dict[str, str]:
@@ -117,6 +123,10 @@ class FrameSamples:
         sample = augment(frame, chosen, self.recipe, self.image_hw, rng, self.decoder)
         return _with_or_without_pose(sample, self.pose, f"sample {frame.key} of {self.name}")
 
+    def key(self, index: int) -> str:
+        """Return the frame's key."""
+        return self.source[index].key
+
     def fingerprint(self) -> dict[str, str]:
         """Return that of the source."""
         return dict(self.source.fingerprint())
@@ -154,6 +164,10 @@ class SyntheticSamples:
             self._dataset = SyntheticDataset(self._config, self._seed)
         count = len(self._views.draw(self._config.num_views, rng, most_views))
         return _with_or_without_pose(self._dataset.sample(index, count), self._pose, self.name)
+
+    def key(self, index: int) -> str:
+        """Return the number."""
+        return str(index)
 
     def fingerprint(self) -> dict[str, str]:
         """Return nothing: the config says it all."""
@@ -215,10 +229,15 @@ class Mixture:
             except CorruptSampleError as error:
                 skipped.append(Skipped(part, error.key, str(error)))
                 continue
-            return Drawn(sample, part, tuple(skipped))
+            return Drawn(sample, part, index, tuple(skipped))
         raise ValueError(
             f"{MAX_TRIES} samples of {samples.name} in a row are corrupt; the last one: {skipped[-1].problem}"
         )
+
+    def key_at(self, position: int, most_views: int) -> str:
+        """Return the part and the key of the sample that `draw` gives: `dexycb 000/0001234`."""
+        drawn = self.draw(position, most_views)
+        return f"{self.names[drawn.part]} {self.parts[drawn.part].key(drawn.index)}"
 
     def fingerprint(self) -> dict[str, dict[str, str]]:
         """Return what identifies the files of every part, by the part's name."""

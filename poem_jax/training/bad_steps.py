@@ -27,6 +27,9 @@ _MOST_KEPT = 8
 _MOST_ROWS = 16
 """Samples in the picture of a batch."""
 
+_MOST_NAMED = 8
+"""Samples whose keys a message gives."""
+
 StepMetrics = Mapping[str, float]
 
 log = logging.getLogger(__name__)
@@ -42,6 +45,8 @@ class BadSteps:
     draw: BatchAt
     positions: Callable[[int, int], Sequence[int]] | None = None
     """From a step and a number of rows to the samples' positions in their source; None = it has none."""
+    key_at: Callable[[int, int], str] | None = None
+    """From such a position and the batch's number of views to how the user knows the sample."""
     left_out: list[int] = field(default_factory=list)
     """The steps that were left out, counted from 0."""
 
@@ -100,7 +105,7 @@ class BadSteps:
             place = f"the batch could not be saved ({error})"
         else:
             place = f"the batch is in {file}, its images in {file.with_suffix('.png').name}"
-        return f"{of}; {place}; {_cause(batch, names)}"
+        return f"{of}; {place}; {_cause(batch, names, self.key_at)}"
 
 
 def positions_in(config: DataConfig) -> Callable[[int, int], Sequence[int]]:
@@ -111,17 +116,21 @@ def positions_in(config: DataConfig) -> Callable[[int, int], Sequence[int]]:
     return lambda step, rows: host_rows(step, rows * hosts, largest, host=host, hosts=hosts)
 
 
-def _cause(batch: MultiViewBatch, names: Sequence[int]) -> str:
+def _cause(batch: MultiViewBatch, names: Sequence[int], key_at: Callable[[int, int], str] | None) -> str:
     """Say which arrays of which samples are not finite, or that it is not the data."""
-    found = []
+    found, wrong = [], set()
     for name, leaf in flatten(batch).items():
         array = np.asarray(leaf)
         if np.issubdtype(array.dtype, np.floating):
             finite = np.isfinite(array).reshape(len(array), -1).all(1)
             rows = [names[int(row)] for row in np.flatnonzero(~finite)]
             found += [f"{name} of sample {_listed(rows)}"] if rows else []
+            wrong |= {*rows}
     if found:
-        return f"its data are not finite: {', '.join(found)}"
+        first = sorted(wrong)[:_MOST_NAMED] if key_at else []
+        keys = ", ".join(f"{row} is {key_at(row, batch.views.shape[1])}" for row in first if key_at)
+        more = f", and {len(wrong) - len(first)} more" if first and len(first) < len(wrong) else ""
+        return f"its data are not finite: {', '.join(found)}" + (f"; sample {keys}{more}" if keys else "")
     return "its data are finite, so lower the learning rate"
 
 

@@ -93,7 +93,8 @@ def train(config: TrainConfig, *, batch_at: BatchAt | None = None, command: str 
         state = initial_state(config, checkpoints, mesh)
         sitting.begin(int(state.step), checkpoints)
         positions = positions_in(config.data) if batch_at is None else None
-        bad_steps = BadSteps(run_dir, config.train.skip_bad_steps, draw, positions, sitting.left_out)
+        key_at = None if mixture is None else mixture.key_at
+        bad_steps = BadSteps(run_dir, config.train.skip_bad_steps, draw, positions, key_at, sitting.left_out)
         batches = draw_ahead(
             draw, sitting.step, ahead=config.data.prefetch, workers=drawing_threads(config.data)
         )

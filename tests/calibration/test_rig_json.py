@@ -83,6 +83,15 @@ def test_a_rational_lens_among_others(tmp_path, content, terms):
     np.testing.assert_array_equal(read_rig(write_rig(tmp_path / "again.json", rig)).dist, rig.dist)
 
 
+@pytest.mark.parametrize("count", [12, 14])
+def test_thin_prisms_and_tilted_sensors(tmp_path, content, count):
+    terms = [0.5, 0.1, 1e-3, 0, 0.01, 0.6, 0.05, 0.001, 1e-3, 2e-3, -1e-3, 5e-4, 0.01, -0.02][:count]
+    content["cameras"][1]["dist"] = terms
+    rig = read_rig(rewrite(tmp_path, content))
+    np.testing.assert_array_equal(rig.dist[1], terms)
+    np.testing.assert_array_equal(read_rig(write_rig(tmp_path / "again.json", rig)).dist, rig.dist)
+
+
 @pytest.mark.parametrize("key", ["distortions", "distCoef", "dist_coeffs", "distortion", "D"])
 def test_lens_terms_under_the_names_of_other_tools(tmp_path, content, rig, key, caplog):
     read_rig(rewrite(tmp_path, content))
@@ -93,16 +102,10 @@ def test_lens_terms_under_the_names_of_other_tools(tmp_path, content, rig, key, 
     assert f"`{key}` is read as `dist`" in caplog.text
 
 
-def fisheye(content):
-    content["cameras"][0]["fisheye"] = True
-
-
 UNREAD_LENSES = {
-    "fisheye": fisheye,
-    "fisheye of the whole rig": lambda c: c.update(fisheye=True),
-    "lens model": lambda c: change(c, distortion_model="equidistant"),
-    "projection": lambda c: change(c, projection="kannala_brandt"),
-    "model of the whole rig": lambda c: c.update(camera_model="OPENCV_FISHEYE"),
+    "lens model": lambda c: change(c, distortion_model="double_sphere"),
+    "projection": lambda c: change(c, projection="equisolid"),
+    "model of the whole rig": lambda c: c.update(camera_model="FOV"),
     "apart": lambda c: change(c, dist=None, radial=[-0.3, 0.05], tangential=[0, 0]),
     "each its own key": lambda c: change(c, dist=None, k1=-0.3, k2=0.05),
     "misspelt": lambda c: change(c, dist=None, distorsion=[-0.3, 0.05, 0, 0, 0]),
@@ -114,6 +117,34 @@ UNREAD_LENSES = {
 def test_what_is_said_of_the_lens_is_never_ignored(tmp_path, content, case):
     UNREAD_LENSES[case](content)
     with pytest.raises(ValueError, match=r"says something of the lens that is not read"):
+        read_rig(rewrite(tmp_path, content))
+
+
+FISHEYES = {
+    "of the camera": lambda c: change(c, fisheye=True),
+    "of the whole rig": lambda c: c.update(fisheye=True),
+    "by its model": lambda c: change(c, distortion_model="equidistant"),
+    "by its projection": lambda c: change(c, projection="kannala_brandt"),
+    "by the model of the whole rig": lambda c: c.update(camera_model="OPENCV_FISHEYE"),
+}
+
+
+@pytest.mark.parametrize("case", FISHEYES)
+def test_fisheyes_have_four_terms(tmp_path, content, case):
+    for camera in content["cameras"]:
+        camera["dist"] = [0.05, -0.02, 0.004, -0.001]
+    FISHEYES[case](content)
+    rig = read_rig(rewrite(tmp_path, content))
+    assert rig.fisheye[0]
+    assert rig.fisheye[1] == ("whole" in case)
+    np.testing.assert_array_equal(rig.dist[0, :4], [0.05, -0.02, 0.004, -0.001])
+    for got, expected in zip(read_rig(write_rig(tmp_path / "again.json", rig))[1:], rig[1:], strict=True):
+        np.testing.assert_allclose(got, expected, atol=1e-12)
+    change(content, dist=[-0.3, 0.05, 0, 0, 0.01])
+    with pytest.raises(ValueError, match=r"must hold the 4 terms of a fisheye, k1 k2 k3 k4 .*; got 5"):
+        read_rig(rewrite(tmp_path, content))
+    change(content, dist=None)
+    with pytest.raises(ValueError, match="has a fisheye, and no terms of it"):
         read_rig(rewrite(tmp_path, content))
 
 
@@ -192,7 +223,7 @@ BAD = {
         lambda c: c.pop("unit"),
         "`unit` is missing; write one of metre, centimetre, millimetre",
     ),
-    "unit unknown": (lambda c: c.update(unit="inch"), "`unit` must be one of .*; got 'inch'"),
+    "unit unknown": (lambda c: c.update(unit="foot"), "`unit` must be one of .*; got 'foot'"),
     "no cameras": (lambda c: c.update(cameras=[]), "`cameras` must be a list of at least one camera"),
     "key missing": (lambda c: c["cameras"][1].pop("R"), "camera 'front': `R` is missing; found name"),
     "camera twice": (
@@ -277,8 +308,10 @@ BAD = {
     "shape": (lambda c: change(c, t=[0, 1]), r"`t` must have shape \(3,\); got \(2,\)"),
     "text": (lambda c: change(c, t=["a", "b", "c"]), "`t` must hold numbers"),
     "size": (lambda c: change(c, width=240.5), "whole pixels, 1 to 100000; got 240.5 x 180"),
-    "two lens terms": (lambda c: change(c, dist=[0.1] * 2), r"`dist` must hold 4, 5 or 8 terms.*; got 2"),
-    "thin prisms": (lambda c: change(c, dist=[0.1] * 12), r"thin prisms and tilted sensors are not modelled"),
+    "two lens terms": (
+        lambda c: change(c, dist=[0.1] * 2),
+        r"`dist` must hold 4, 5, 8, 12 or 14 terms.*; got 2",
+    ),
     "lens as an object": (lambda c: change(c, dist={"k1": 0.1}), "`dist` must be a list k1 k2 p1 p2 k3"),
     "lens as text": (lambda c: change(c, dist="none"), "`dist` must hold numbers"),
 }

@@ -77,7 +77,9 @@ def run(network):
 
     def start(capture, out, **options):
         return reconstruct(
-            read_take(capture.folder), out, **{"network": network, "progress": False, **options}
+            read_take(capture.folder),
+            out,
+            **{"engine": "poem", "network": network, "progress": False, **options},
         )
 
     return start

@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.capture.agreement import judge_boxes
 from poem_jax.capture.crop import crop_hands, hand_squares
 from poem_jax.capture.frame import Frame, HandResult
 from poem_jax.data.lens import project_raw
 from poem_jax.geometry.cameras import project
+from poem_jax.geometry.distortion import fisheye_lens, stack_lenses
 from poem_jax.hand.topology import ROOT_JOINT, WRIST
 from poem_jax.models.config import CropConfig
 
@@ -136,3 +138,26 @@ def test_a_view_with_too_few_key_points_falls_back_on_its_box(frame, rig):
     few = hand_squares(frame._replace(keypoints_px=keypoints), rig)
     by_box = hand_squares(frame._replace(keypoints_px=None), rig)
     np.testing.assert_array_equal(few[0, 1], by_box[0, 1])
+
+
+def test_a_hand_that_a_fisheye_sees_far_aside_counts_as_unseen_and_is_said(frame, rig):
+    """No flat picture shows what lies more than 85 degrees off the axis, though the image has it."""
+    frame, _ = frame
+    fisheye = fisheye_lens(np.zeros(4))
+    rig = rig._replace(dist=stack_lenses([*rig.dist[:2], fisheye]))
+    aside = np.radians([83.0, 92.0])
+    for angle, seen in zip(aside, (True, False), strict=True):
+        centre = rig.K[2, :2, 2] + [rig.K[2, 0, 0] * angle, 0]
+        keypoints = frame.keypoints_px.copy()
+        keypoints[0, 2] = centre + np.random.default_rng(0).uniform(-4, 4, (21, 2))
+        boxes = np.concatenate([keypoints.min(2), keypoints.max(2)], -1)
+        there = frame._replace(keypoints_px=keypoints, boxes_px=boxes)
+        squares = hand_squares(there, rig)
+        np.testing.assert_array_equal(np.isfinite(squares[0]).all(-1), [True, True, seen])
+        if not seen:
+            (judged,) = judge_boxes([there], rig)
+            assert judged.warnings == (
+                "camera 'cam 3': 1 hands lie where its fisheye looks more than 85 degrees aside, which no "
+                "flat picture shows: they count as unseen",
+            )
+            assert judged.hands[0].reason is None

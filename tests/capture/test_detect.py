@@ -126,7 +126,7 @@ def test_a_search_that_is_stopped_too_early_writes_nothing(capture, rig, seen, c
     with pytest.raises(KeyboardInterrupt):
         detect_hands(capture, rig, detector=disagreeing, when_stopped=kept.append, progress=False)
     assert kept == []
-    assert "nothing is written of the frames that were searched" in caplog.text
+    assert "no key points are written of the frames that were searched" in caplog.text
 
 
 def test_part_of_a_search_has_a_name_of_its_own(make_capture, monkeypatch, capsys, hand_boxes):

@@ -9,12 +9,12 @@ import pytest
 
 from poem_jax.capture.association import associate_hands
 from poem_jax.capture.boxes_file import read_boxes
-from poem_jax.capture.demo import demo_folder
 from poem_jax.capture.rig_file import read_rig
 from poem_jax.cli import main
 from poem_jax.data.capture_folder import find_frames
 from poem_jax.detection import HandTracker, find_hands
 from poem_jax.io.images import read_image
+from tests.one_hand.capture import one_hand_folder
 
 CAMERAS = tuple(f"cam_{view}" for view in range(4))
 
@@ -22,7 +22,7 @@ CAMERAS = tuple(f"cam_{view}" for view in range(4))
 @pytest.fixture(scope="module")
 def pictures():
     """The bundled capture, BGR."""
-    return {name: cv2.imread(str(demo_folder() / f"{name}.jpg")) for name in CAMERAS}
+    return {name: cv2.imread(str(one_hand_folder() / f"{name}.jpg")) for name in CAMERAS}
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def take(tmp_path):
     """Write a take: a rig whose pictures were moved and scaled, and the encoded images of its frames."""
 
     def write(frames, maps=None):
-        rig = json.loads((demo_folder() / "rig.json").read_text())
+        rig = json.loads((one_hand_folder() / "rig.json").read_text())
         for camera in rig["cameras"]:
             scale, (left, top), (width, height) = (maps or {}).get(camera["name"], (1, (0, 0), (512, 512)))
             K = np.array(camera["K"])
@@ -73,7 +73,7 @@ def detected(folder):
 def plain(pictures, tmp_path_factory):
     folder = tmp_path_factory.mktemp("plain")
     (folder / "frames" / "0").mkdir(parents=True)
-    (folder / "rig.json").write_bytes((demo_folder() / "rig.json").read_bytes())
+    (folder / "rig.json").write_bytes((one_hand_folder() / "rig.json").read_bytes())
     for name, picture in pictures.items():
         (folder / "frames" / "0" / f"{name}.png").write_bytes(encoded(picture)[1])
     found = detected(folder)

@@ -12,21 +12,24 @@ import pytest
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
-from poem_jax.capture.fit import _windows, hands_of
+from poem_jax.capture.fit import _windows, fit_hands
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames
-from poem_jax.capture.pipeline import fit
-from poem_jax.capture.take import Take, make_take, read_keypoint_take
+from poem_jax.capture.pipeline import fit, reconstruct
+from poem_jax.capture.smoothing import Smoothing
+from poem_jax.capture.take import Take, make_take, read_keypoint_take, read_take
 from poem_jax.cli import main
 from poem_jax.data.capture_folder import FramePaths
-from poem_jax.geometry.distortion import distort_pixels
+from poem_jax.geometry.distortion import distort_pixels, fisheye_lens, stack_lenses
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid, rotation_from_axis_angle
 from poem_jax.geometry.world_origin import move_origin
 from poem_jax.hand.model import hand_mesh
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO
 from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
+from tests.capture.stub_network import lost_network
 
 FRAMES, VIEWS, SIDES = 6, 4, ("right", "left")
 
@@ -253,12 +256,81 @@ def test_the_command_writes_what_reconstruct_writes(files, fitted, tmp_path, cap
 def test_reconstruct_with_the_fit_as_engine(files, tmp_path, capsys):
     keypoints, rig, images = files
     arguments = ["reconstruct", str(images), "--rig", str(rig), "--boxes", str(keypoints), "--out"]
-    assert main([*arguments, str(tmp_path / "out"), "--engine", "fit"]) == 0
-    assert "12 of 12 hands in 6 frames" in capsys.readouterr().out
+    formats = ["--formats", "glb,bvh,csv,trc,mano"]
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", *formats]) == 0
+    said = capsys.readouterr()
+    assert "12 of 12 hands in 6 frames" in said.out
+    for name in (
+        "hands.glb",
+        "right.bvh",
+        "left.bvh",
+        "joints.csv",
+        "joint_angles.csv",
+        "hands.trc",
+        "mano.npz",
+    ):
+        assert name in said.out
+        assert (tmp_path / "out" / name).is_file()
+    assert (
+        json.loads((tmp_path / "out" / "report.json").read_text())["animation"]["left"]["moves_by"]
+        == "skeleton"
+    )
+    assert main([*arguments, str(tmp_path / "out"), "--formats", "fbx"]) == 2
+    assert "--formats must be a list of glb, bvh" in capsys.readouterr().err
     assert main([*arguments, str(tmp_path / "out"), "--engine", "fit", "--checkpoint", "ckpt"]) == 2
     assert "a fit has no weights" in capsys.readouterr().err
-    assert main([*arguments, str(tmp_path / "out"), "--smooth"]) == 2
+    assert main([*arguments, str(tmp_path / "out"), "--engine", "poem", "--mano", "hand.npz"]) == 2
     assert "for --engine fit" in capsys.readouterr().err
+    assert main([*arguments, str(tmp_path / "out"), "--bridge", "0.1"]) == 2
+    assert "--bridge goes with --smooth" in capsys.readouterr().err
+
+
+def test_of_both_engines_the_better_one_is_taken(files, fitted, tmp_path):
+    """The images show nothing, so that the network loses every hand; the fit does the take."""
+    keypoints, rig, images = files
+    take = read_take(images, rig, keypoints)
+    written = reconstruct(take, tmp_path / "out", network=lost_network(), progress=False)
+    choice = written.report["engine_choice"]
+    assert written.report["engine"] == choice["engine"] == "fit"
+    assert choice["by"] == "views left out"
+    assert choice["figures"]["fit"]["left_out_px"] < 3
+    assert choice["figures"]["poem"] == {"left_out_px": None, "hands_lost": 1.0}
+    assert written.report["timings_s"]["choose_engine"] > 0
+    np.testing.assert_allclose(
+        written.arrays["joints_world"],
+        fitted.arrays["joints_world"],
+        atol=1e-4,
+    )
+
+
+def test_a_fit_that_is_not_smoothed_asks_for_no_times(take):
+    """A file of key points may know when some of its frames were taken."""
+    frames = [frame._replace(time_s=9.0 if i == 2 else None) for i, frame in enumerate(take.frames)]
+    found = fit_hands(iter(frames), take, hands_of(default_hand()))
+    assert all(hand.reason is None for frame in found for hand in frame.hands)
+    with pytest.raises(ValueError, match="must have times, or none"):
+        list(fit_hands(iter(frames), take, hands_of(default_hand()), smooth=True))
+
+
+def test_a_key_point_that_is_off_is_not_borne_out(take):
+    """0 for the one that no other view agrees with, about 0.9 for the others, NaN for those unseen."""
+    keypoints = take.frames.hands.keypoints_px.copy()
+    keypoints[2, 0, 1, 8] += 40.0
+    keypoints[2, 0, 3, 4] = np.nan
+    confidence = np.ones(keypoints.shape[:-1])
+    confidence[2, 0, 0] = 0.5
+    changed_take = changed(take, keypoints_px=keypoints, confidence=confidence)
+    frames = list(fit_hands(changed_take.frames, changed_take, hands_of(default_hand())))
+    trust = frames[2].hands[0].joint_confidence
+    assert trust.shape == (VIEWS, 21)
+    assert trust[1, 8] == 0
+    assert np.isnan(trust[3, 4])
+    assert np.isnan(trust).sum() == 1
+    assert 0.7 < np.median(trust[2]) < 1
+    assert np.median(trust[0]) == pytest.approx(0.5 * np.median(trust[2]), abs=0.1)
+    everything = np.stack([hand.joint_confidence for frame in frames for hand in frame.hands])
+    assert np.nanmax(everything) <= 1
+    assert np.nanmin(everything) >= 0
 
 
 def test_key_points_and_rig_of_different_views_are_refused(files, take, tmp_path):
@@ -282,6 +354,24 @@ def test_points_beyond_the_fold_of_a_lens_are_dropped(take):
     ideal = ideal_keypoints(take.rig, keypoints)
     assert np.isnan(ideal[0, 0, 0, 0]).all()
     assert np.isnan(ideal).sum() == 2
+
+
+@pytest.mark.slow
+def test_the_same_hands_are_found_through_fisheyes_and_other_lenses(take, fitted, truth, tmp_path):
+    """A rig of mixed lenses; what a fisheye sees too far aside is left out, and said."""
+    lenses = [fisheye_lens(np.array([0.05, -0.02, 0.004, -0.001]))] * 2
+    lenses += [np.array([0.5, 0.1, 1e-3, -2e-3, 0.01, 0.6, 0.05, 1e-3, 1e-3, 0, -1e-3, 0, 0.02, -0.01])] * 2
+    rig = take.rig._replace(dist=stack_lenses(lenses))
+    ideal = np.moveaxis(ideal_keypoints(take.rig, take.frames.hands.keypoints_px), 2, 0)
+    raw = distort_pixels(ideal.reshape(VIEWS, -1, 2), rig.K, rig.dist).reshape(ideal.shape)
+    keypoints = np.moveaxis(raw, 0, 2).copy()
+    keypoints[0, 0, 0, 3] = rig.K[0, :2, 2] + [1.6 * rig.K[0, 0, 0], 0]
+    arrays = fit(with_keypoints(rig, keypoints), tmp_path, progress=False).arrays
+    assert np.abs(error_mm(arrays, truth) - error_mm(fitted.arrays, truth))[1:].max() < 0.5
+    warnings = json.loads((tmp_path / "report.json").read_text())["warnings"]
+    assert [
+        w for w in warnings if "camera 'cam_0': 1 key points lie where its fisheye looks more than 85" in w
+    ]
 
 
 def test_hands_outside_their_image_are_not_fitted(files, take, tmp_path, caplog):
@@ -332,7 +422,9 @@ def test_smoothing_from_the_command_line(files, fitted, tmp_path):
     keypoints, rig, _ = files
     out = tmp_path / "out"
     assert main(["fit", str(keypoints), "--rig", str(rig), "--out", str(out), "--smooth"]) == 0
-    assert json.loads((out / "report.json").read_text())["smooth"] is True
+    said = json.loads((out / "report.json").read_text())["smoothing"]
+    assert (said["mode"], said["bridge_s"], said["bridged_hands"]) == ("offline", 0.2, 0)
+    assert 0 < said["jitter_after_mm"] <= 1.01 * said["jitter_before_mm"]
     smooth = np.load(out / "prediction.npz")
     assert smooth["valid"].all()
     moved = np.linalg.norm(smooth["joints_world"] - fitted.arrays["joints_world"], axis=-1)
@@ -372,7 +464,8 @@ def test_takes_of_any_length_share_compiled_programs(take, tmp_path, compilation
 @pytest.mark.parametrize("smooth", [False, True])
 def test_a_long_take_is_fitted_group_by_group_with_one_shape(take, tmp_path, truth, smooth):
     count = 2 * FRAMES_TOGETHER + 9
-    written = fit(longer(take, count), tmp_path, progress=False, smooth=smooth)
+    smoothing = Smoothing("offline" if smooth else "off")
+    written = fit(longer(take, count), tmp_path, progress=False, smoothing=smoothing)
     arrays = written.arrays
     assert arrays["frames"].tolist() == [f"{frame:04d}" for frame in range(count)]
     assert arrays["valid"].all()

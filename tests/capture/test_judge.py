@@ -28,7 +28,7 @@ def stub_network(vertices, joints, root, valid=True):
         return Prediction(vertices, joints, root, keypoints, layers, solved)
 
     config = Config(image_hw=(64, 64))
-    params = {"constants": {"hand": {"faces": default_hand().faces}}}
+    params = {"constants": {"hand": default_hand()._asdict()}}
     return Network(config, Prepared(params, None, config), "stub", answer)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from poem_jax.capture.crop import crop_image
-from poem_jax.capture.write import make_gallery
+from poem_jax.capture.outputs.page import make_gallery
 from poem_jax.data.lens import picture_map, project_raw, take_picture
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.distortion import undistort_pixels
@@ -118,5 +118,5 @@ def test_the_pages_pictures_fill_their_frames(rig):
     white = np.full((180, 240, 3), 255, np.uint8)
     for camera, where in zip(gallery.cameras, gallery.maps, strict=True):
         picture = take_picture(white, where)
-        assert picture.shape[:2] == camera.hw == (240, 320)
+        assert picture.shape[:2] == camera.hw == (180, 240)
         assert (picture > 0).all(-1).mean() > 0.88  # 58 % if it looked along the camera's own axis

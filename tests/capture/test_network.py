@@ -4,9 +4,9 @@ import numpy as np
 
 from poem_jax.batch import Prediction
 from poem_jax.capture.crop import crop_hands, hand_squares
+from poem_jax.capture.engines import by_network
 from poem_jax.capture.frame import HandCrops, HandResult
 from poem_jax.capture.network import MAX_BATCH, UNDETERMINED, Network, predict_hands
-from poem_jax.capture.pipeline import by_network
 from poem_jax.capture.read import read_images
 from poem_jax.capture.report import Clock
 from poem_jax.capture.take import read_take

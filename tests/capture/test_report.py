@@ -57,10 +57,28 @@ def test_the_whole_report(report, tmp_path):
         "against": "the model's own heat maps",
         "mean_px": 1.5,
         "median_px": 1.5,
+        "median_px_by_camera": {"left_cam": 1.0, "front": 2.0},
         "views_used": 5,
     }
     assert content["nothing"] is None
+    assert content["frames_per_second"] is None
+    assert content["median_joint_sigma_mm"] is None
+    assert content["bridged_frames"] == {"right": 0}
     assert content["timings_s"] == {"total": 1.5}
+
+
+def test_times_bridged_frames_and_uncertainty(report, tmp_path):
+    for index, (time_s, bridged) in enumerate([(0.0, False), (0.04, True), (0.08, False), (0.5, False)]):
+        hand = found(1.0, 2.0, np.nan)._replace(
+            joint_sigma_m=np.full(21, 0.001 + index / 1000), bridged=bridged
+        )
+        report.add(frame(str(index), hand)._replace(time_s=time_s))
+    content = json.loads(report.write({}, {}).read_text())
+    assert content["frames_per_second"] == pytest.approx(25)
+    assert content["bridged_frames"] == {"right": 1}
+    assert content["median_joint_sigma_mm"] == pytest.approx(2.5)
+    assert [entry["time_s"] for entry in content["frames"]] == [0.0, 0.04, 0.08, 0.5]
+    assert [entry["hands"][0].get("bridged") for entry in content["frames"]] == [None, True, None, None]
 
 
 def test_a_take_without_any_hand_ends_with_the_reason_that_matters(report):

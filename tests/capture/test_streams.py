@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import Prediction
-from poem_jax.capture import agreement, write
+from poem_jax.capture import agreement
 from poem_jax.capture.network import Network
+from poem_jax.capture.outputs import page
 from poem_jax.capture.pipeline import reconstruct
 from poem_jax.capture.take import read_take
 from poem_jax.hand.template import default_hand
@@ -39,7 +40,7 @@ def flat_network(stop=None):
             cams.view_mask.any(-1),
         )
 
-    params = {"constants": {"hand": {"faces": hand.faces}}}
+    params = {"constants": {"hand": hand._asdict()}}
     return Network(Config(image_hw=(64, 64)), Prepared(params, None, Config()), "stub", answer)
 
 
@@ -60,7 +61,7 @@ def frames_of(path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_take(make_capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(write, "PAGE_FRAMES", 2)
+    monkeypatch.setattr(page, "PAGE_FRAMES", 2)
     monkeypatch.setattr(agreement, "_WINDOW", 8)
     take = read_take(make_capture().folder)
     held = {}

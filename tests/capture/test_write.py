@@ -6,15 +6,17 @@ import pytest
 from poem_jax.capture import write
 from poem_jax.capture.boxes_file import write_boxes
 from poem_jax.capture.frame import Frame, HandResult
-from poem_jax.capture.write import frame_folder, prediction_entry
+from poem_jax.capture.outputs import page
+from poem_jax.capture.outputs.prediction import prediction_entry
+from poem_jax.capture.write import frame_folder
 
 
 def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
     make_capture, tmp_path, run, monkeypatch
 ):
     pages = []
-    monkeypatch.setattr(write, "PAGE_FRAMES", 2)
-    monkeypatch.setattr(write, "write_page", lambda path, frames, *_: pages.append(frames) or path)
+    monkeypatch.setattr(page, "PAGE_FRAMES", 2)
+    monkeypatch.setattr(write, "write_page", lambda path, frames, *_, **__: pages.append(frames) or path)
     capture = make_capture(7)
     capture.hands.boxes_px[::2] = np.nan
     write_boxes(capture.folder / "boxes.npz", capture.hands)
@@ -23,16 +25,14 @@ def test_the_page_of_a_long_take_is_thinned_among_the_frames_with_a_hand(
     assert all(frame.hands for frame in pages[0])
 
 
-def test_a_page_that_cannot_be_recorded_costs_the_page_alone(
-    make_capture, tmp_path, run, monkeypatch, caplog
-):
-    def no_port(*_):
-        raise OSError("no free port")
+def test_a_page_that_cannot_be_written_costs_the_page_alone(make_capture, tmp_path, run, monkeypatch, caplog):
+    def full(*_, **__):
+        raise OSError("no space left")
 
-    monkeypatch.setattr(write, "write_page", no_port)
+    monkeypatch.setattr(write, "write_page", full)
     run(make_capture(), tmp_path / "out")
     assert (tmp_path / "out" / "report.json").exists()
-    assert "the 3D page cannot be written, everything else is: no free port" in caplog.text
+    assert "the 3D page cannot be written, everything else is: no space left" in caplog.text
 
 
 def test_a_new_run_removes_its_own_meshes_of_hands_that_it_lost(make_capture, tmp_path, run):
@@ -79,6 +79,18 @@ def test_the_entry_of_a_frame_is_nan_where_a_hand_is_lost():
     np.testing.assert_array_equal(entry["shape"][1], np.arange(10))
     assert np.isnan(entry["pose"]).all()
     assert entry["joints_world"].dtype == np.float32
+    assert np.isnan(entry["joint_confidence"]).all()
+    assert np.isnan(entry["time_s"])
+    assert entry["bridged"].tolist() == [False, False]
+
+
+def test_the_entry_of_a_frame_tells_its_time_what_is_bridged_and_what_bears_a_hand_out():
+    confidence = np.linspace(0, 1, 63).reshape(3, 21)
+    hand = found(2.0, joint_confidence=confidence, bridged=True)
+    entry = prediction_entry(Frame("a", np.full((1, 3, 4), np.nan), hands=(hand,), time_s=1.25), np.zeros(3))
+    assert entry["time_s"] == 1.25
+    assert entry["bridged"].tolist() == [True]
+    np.testing.assert_allclose(entry["joint_confidence"][0], confidence, atol=1e-7)
 
 
 def test_a_far_world_keeps_its_millimetres():
@@ -107,7 +119,7 @@ def test_a_link_that_leads_elsewhere_is_not_followed(tmp_path):
         frame_folder(tmp_path / "out", "0000")
 
 
-@pytest.mark.parametrize("name", ["prediction.npz", "report.json", "index.html", "hands.glb"])
+@pytest.mark.parametrize("name", ["prediction.npz", "report.json", "index.html", "hands.glb", "right.bvh"])
 def test_a_folder_with_the_name_of_a_result_is_found_before_the_work(make_capture, tmp_path, run, name):
     mine = tmp_path / "out" / name / "mine"
     mine.parent.mkdir(parents=True)

@@ -1,20 +1,18 @@
 """Hands in images: what MediaPipe itself finds in photographs, videos, and images without a hand."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-import poem_jax.capture
 from poem_jax.calibration.rig_json import read_rig
 from poem_jax.data.lens import project_raw
 from poem_jax.detection import HandTracker, find_hands
 from poem_jax.detection import detector as detector_module
 from poem_jax.detection.regions import Region
 from poem_jax.io.images import read_image
+from tests.one_hand.capture import one_hand_folder
 
-DEMO = Path(poem_jax.capture.__file__).parent / "demo"
+ONE_HAND = one_hand_folder()
 
 SIDE_OF_LABEL = {"Left": "right", "Right": "left"}
 """MediaPipe names sides as if images were mirrored."""
@@ -86,13 +84,13 @@ def test_what_is_no_hand_gives_its_place_to_a_hand(golden):
     assert {hand.side for hand in tracker.find_hands(image)} == {"left", "right"}
 
 
-def test_the_hand_of_the_bundled_capture_is_found():
-    """A rendered hand; the network was trained on real ones."""
-    image = read_image(DEMO / "cam_0.jpg")
+def test_a_rendered_hand_is_found():
+    """The network was trained on real ones."""
+    image = read_image(ONE_HAND / "cam_0.jpg")
     ((hand,),) = find_hands([image, image])[:1]
-    truth = np.load(DEMO / "ground_truth.npz")
+    truth = np.load(ONE_HAND / "ground_truth.npz")
     joints = truth["joints_world"].reshape(-1, 21, 3)[0]
-    rig = read_rig(DEMO / "rig.json")
+    rig = read_rig(ONE_HAND / "rig.json")
     expected = project_raw(rig, 0, joints)[0]
     size = np.ptp(expected, axis=0).max()
     assert hand.side == "right"

@@ -9,7 +9,7 @@ import pytest
 
 import poem_jax.capture.fit
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, read_boxes, write_boxes
-from poem_jax.capture.fit import fit_hands, hands_of
+from poem_jax.capture.fit import fit_hands
 from poem_jax.capture.frame import HandResult
 from poem_jax.capture.judge import judge_hands
 from poem_jax.capture.take import Take, make_take
@@ -35,6 +35,7 @@ from poem_jax.geometry.cameras import project
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle
 from poem_jax.hand.model import mirror_pose
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import FINGER_JOINTS, INDEX_KNUCKLE, LITTLE_KNUCKLE
 from poem_jax.synthetic.keypoint_takes import IMAGE_WH, draw_keypoint_take

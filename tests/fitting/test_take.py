@@ -11,6 +11,7 @@ from poem_jax.fitting.lm import LMConfig, ShapeMode, TakeObservations, TakeState
 from poem_jax.fitting.silhouette import SilhouetteTarget
 from poem_jax.fitting.smooth import SmoothConfig, eliminate, smooth, take_cost
 from poem_jax.fitting.start import can_be_placed, closed_form_pose
+from poem_jax.fitting.take import _fit_take
 from poem_jax.geometry.cameras import Cameras, project, resize_intrinsics
 from poem_jax.geometry.transforms import rotation_from_axis_angle
 from poem_jax.geometry.triangulation import triangulate
@@ -319,7 +320,8 @@ def test_the_second_pass_never_raises_the_cost(model, takes):
 
     @jax.jit
     def costs(model, state):
-        end, motion = smooth(model, seen, state, LMConfig(), SmoothConfig(sigma_angle=1e-3, sigma_m=1e-4))
+        walk = SmoothConfig(sigma_angle=1e-3, sigma_m=1e-4)
+        end, motion = smooth(model, seen, state, LMConfig(), walk, jnp.full(3, 1 / 30))
         return tuple(take_cost(model, seen, s, LMConfig(), motion) for s in (state, end))
 
     before, after = costs(model, begin)
@@ -432,3 +434,60 @@ def test_released_key_points(shared_dir):
     )
     assert fitted <= 1.3
     assert fitted < dlt
+
+
+def at_times(model, take, mask, time_s):
+    return fit_take(model, weighted(take, mask), config=FitConfig(smooth=AT_REST), time_s=time_s)
+
+
+@pytest.mark.slow
+def test_the_walk_grows_with_the_time_between_frames(model, takes):
+    """Every second frame left out is every second frame unseen, if the others say when they were taken."""
+    take = walking(takes(FRAMES, 4, 0.0, 13), model.hand, 0.5)
+    every = np.arange(FRAMES) / 30
+    mask = np.ones(take.uv_px.shape[:-1], bool)
+    mask[1::2] = False
+    unseen = at_times(model, take, mask, every)
+    half = FRAMES // 2
+    order = np.concatenate([np.arange(0, FRAMES, 2), np.arange(1, FRAMES, 2)])
+    mask = np.ones(take.uv_px.shape[:-1], bool)
+    mask[half:] = False
+    kept = take._replace(uv_px=take.uv_px[order])
+    times = np.concatenate([every[::2], every[-1] + np.arange(1, 1 + half) / 30])
+    left_out = at_times(model, kept, mask, times)
+    away = 1000 * np.linalg.norm(left_out.joints[:half] - unseen.joints[::2], axis=-1)
+    assert away.mean() < 0.1
+    wrong = at_times(model, kept, mask, times / 1000)
+    assert 1000 * np.linalg.norm(wrong.joints[:half] - unseen.joints[::2], axis=-1).mean() > 5 * away.mean()
+    whole = at_times(model, take, np.ones_like(mask), every)
+    near = np.linalg.norm(whole.joints[::2] - left_out.joints[:half], axis=-1)
+    assert (near < 3 * whole.sigma_m[::2]).mean() > 0.95, "what was left out would have changed little"
+
+
+@pytest.mark.slow
+def test_times_compile_nothing_and_frames_alone_are_told(model, takes):
+    """Times far from zero, too; and what the first pass found stays on record."""
+    take = takes(FRAMES, 4, 2.0, 13)
+    mask = np.ones(take.uv_px.shape[:-1], bool)
+    plain = shared(model, take, mask)
+    one = at_times(model, take, mask, None)
+    np.testing.assert_allclose(one.alone, plain.joints, atol=1e-5)
+    np.testing.assert_array_equal(plain.alone, plain.joints)
+    before = _fit_take._cache_size()
+    late = at_times(model, take, mask, 1e6 + np.arange(FRAMES) / 30)
+    assert _fit_take._cache_size() == before
+    np.testing.assert_allclose(late.joints, one.joints, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "said"),
+    [
+        (np.zeros(FRAMES), "grow from frame to frame; got 0.0 and 0.0 of frames 0 and 1"),
+        (np.full(FRAMES, np.nan), "got nan"),
+        (np.arange(3.0), r"shape \(24,\), one moment a frame; got \(3,\)"),
+    ],
+)
+def test_times_that_cannot_be_right_raise(model, takes, time_s, said):
+    take = takes(FRAMES, 4, 2.0, 13)
+    with pytest.raises(ValueError, match=said):
+        at_times(model, take, None, time_s)

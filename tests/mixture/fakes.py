@@ -53,6 +53,9 @@ class FakeSamples:
             keypoints_px=np.zeros((views, 21, 2), np.float32),
         )
 
+    def key(self, index: int) -> str:
+        return f"frame{index}"
+
     def fingerprint(self) -> dict[str, str]:
         return {f"{self.name}.tar": str(self.length)}
 

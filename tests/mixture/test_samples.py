@@ -91,6 +91,17 @@ def test_what_stands_for_a_corrupt_sample_depends_on_nothing_but_its_place():
             assert who(one) == who(other)
 
 
+def test_a_sample_is_known_by_its_part_and_the_key_of_what_stands_there():
+    parts = [FakeSamples("set", 5, bad=frozenset({3})), FakeSamples("set", 9)]
+    mixture = Mixture(parts, (0.5, 0.5), seed=2)
+    for position in range(40):
+        drawn = mixture.draw(position, 4)
+        name = ("set", "set (2)")[drawn.part]
+        assert mixture.key_at(position, 4) == f"{name} frame{int(drawn.sample.joints_world[0, 1])}"
+    part = frames()
+    assert part.key(2) == part.source[2].key
+
+
 def test_a_part_that_is_all_corrupt_ends_the_run():
     part = FakeSamples("first", 60, bad=frozenset(range(60)))
     with pytest.raises(

@@ -25,8 +25,8 @@ def watch(tmp_path, batch_at):
         vertices[2:4, 5] = np.nan
         return batch._replace(vertices_world=vertices)
 
-    def make(allowed=0, positions=None):
-        return BadSteps(tmp_path, allowed, draw, positions)
+    def make(allowed=0, positions=None, key_at=None):
+        return BadSteps(tmp_path, allowed, draw, positions, key_at)
 
     return make
 
@@ -57,6 +57,12 @@ def test_the_first_bad_step_is_named_with_its_samples_and_its_batch(watch, tmp_p
         views = kept["views"]
     picture = cv2.imread(str(tmp_path / "bad_step_6.png"))[..., ::-1]
     np.testing.assert_array_equal(picture[64:96, 32:64], views[2, 1])
+
+
+def test_samples_of_a_mixture_are_named_as_their_users_know_them(watch):
+    bad_steps = watch(key_at=lambda position, views: f"set {10 * position}/{views}")
+    with pytest.raises(FloatingPointError, match=r"2, 3; sample 2 is set 20/3, 3 is set 30/3\. The"):
+        bad_steps.check([(6, BAD)])
 
 
 def test_finite_data_point_to_the_learning_rate(watch):

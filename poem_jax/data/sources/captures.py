@@ -239,7 +239,7 @@ def _key(capture: _Capture, place: _Place) -> str:
 
 def _path(paths: FramePaths, view: int) -> Path:
     path = paths.images[view]
-    assert path is not None
+    assert isinstance(path, Path), "find_frames lists files"
     return path
 
 

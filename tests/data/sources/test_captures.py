@@ -225,7 +225,7 @@ def test_a_hand_of_three_metres_is_a_corrupt_sample(tmp_path):
 @pytest.mark.parametrize(
     ("dist", "message"),
     [
-        (np.zeros((3, 4)), r"`dist` must have shape \(3, 5\)"),
+        (np.zeros((3, 4)), "`dist` must have a row of 5, 8, 12, 14, 15 terms for each of 3 images"),
         (np.full((3, 5), np.nan), "`dist` is not finite in"),
     ],
 )
