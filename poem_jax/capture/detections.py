@@ -172,7 +172,7 @@ class SearchFile:
             os.replace(self._old, returning)
         if _holds_frames(self.path):
             os.replace(self.path, self._old)
-            _log.warning("%s was of another search, and is kept as %s", self.path, self._old)
+            _log.info("%s was of another search, and is kept as %s", self.path, self._old)
         if comes_back:
             os.replace(returning, self.path)
 

@@ -108,11 +108,9 @@ class Convert:
         beside = [path for path in folder.iterdir() if path.exists()]
         for file in (path for path in written if path.exists()):
             if any(file.samefile(path) for path in beside):
-                where = "in" if folder == self.source else "beside"
-                raise ValueError(
-                    f"{file} would be replaced, and lies {where} {self.source}, which is read; give "
-                    "another OUT"
-                )
+                where = f"lies {'in' if folder == self.source else 'beside'} {self.source}, which"
+                where = "" if file.samefile(self.source) else f"{where} "
+                raise ValueError(f"{file} would be replaced, and {where}is read; give another OUT")
 
 
 @dataclass(frozen=True)
