@@ -85,7 +85,7 @@ def read_calibration(
             format of several files any of them may be given; the others are looked for beside it.
         unit: Of its lengths, as `units.metres_of` takes it; None = what the file says, else what is
             customary, which is logged.
-        image_size: Width and height of all images, for formats that do not hold it.
+        image_size: Width and height of all images, for formats that do not hold it; those that do must agree.
 
     Returns: The rig, in metres and in pixels where the image spans [0, W] x [0, H].
 
@@ -104,7 +104,7 @@ def read_calibration(
             documents += _siblings(documents[0], kind)
     document = documents[0]
     if is_rig(document):
-        return read_rig(document.path, unit=unit)
+        return read_rig(document.path, unit=unit, size_wh=image_size)
     kind = _format(document)
     if kind is None:
         raise ValueError(_unknown(document))

@@ -1,5 +1,5 @@
 """What a rig shows by itself, without any key points: cameras that stand twice or look at nothing together,
-intrinsics of another size, a unit by which no room is so large.
+focal lengths that no lens has, a unit by which no room is so large.
 
 All but cameras that stand twice are doubts: key points that fit together take them back.
 """
@@ -10,6 +10,7 @@ import numpy as np
 
 from poem_jax.calibration.findings import Finding
 from poem_jax.calibration.mistakes import HYPOTHESES
+from poem_jax.calibration.units import EXTENT_M
 from poem_jax.geometry.cameras import project
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import invert_rigid
@@ -21,13 +22,10 @@ DUPLICATE = "duplicate cameras"
 _SAME_SHARE = 1e-3
 """Of the rig's extent: centres nearer to each other, of cameras that look the same way, are of one camera."""
 _SAME_TURN = np.radians(0.2)
-_CENTRAL = (0.2, 0.8)
 _MAX_RATIO = 1.25
 """Of fx and fy: pixels are square, or nearly so."""
 _FIELDS_DEG = (3.0, 150.0)
 """Full angles that a pinhole lens is believed to show along the width."""
-_LARGEST_M, _SMALLEST_M = 12.0, 0.04
-"""Between the farthest cameras that look at one pair of hands."""
 _PARALLEL_DEG = 12.0
 """Cameras whose axes differ by less may look past each other."""
 _MARGIN = 0.25
@@ -36,7 +34,7 @@ _MARGIN = 0.25
 
 def judge_rig(rig: Rig) -> list[Finding]:
     """Say what a rig alone gives cause to doubt; [] = nothing. What is certain comes first."""
-    return [*_duplicates(rig), *_directions(rig), *_intrinsics(rig), *_lengths(rig)]
+    return [*_duplicates(rig), *_directions(rig), *_focal_lengths(rig), *_lengths(rig)]
 
 
 def _duplicates(rig: Rig) -> list[Finding]:
@@ -72,22 +70,11 @@ def _directions(rig: Rig) -> list[Finding]:
     return [Finding("cameras look apart", evidence, fix)]
 
 
-def _intrinsics(rig: Rig) -> list[Finding]:
+def _focal_lengths(rig: Rig) -> list[Finding]:
     found = []
-    for name, (width, height), K in zip(rig.names, rig.size_wh, rig.K, strict=True):
-        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        place = np.array([cx / width, cy / height])
+    for name, (width, _), K in zip(rig.names, rig.size_wh, rig.K, strict=True):
+        fx, fy = K[0, 0], K[1, 1]
         field = np.degrees(2 * np.arctan(0.5 * width / fx))
-        if (place < _CENTRAL[0]).any() or (place > _CENTRAL[1]).any():
-            evidence = (
-                f"the principal point of camera '{name}', ({cx:.0f}, {cy:.0f}), is far from the middle of "
-                f"its {width} x {height} image"
-            )
-            fix = (
-                "scale `K` to the size of the images, correct cx and cy, or leave it so if the images are "
-                "cut out of larger ones"
-            )
-            found.append(Finding("principal point", evidence, fix))
         if max(fx / fy, fy / fx) > _MAX_RATIO:
             evidence = f"the pixels of camera '{name}' are not square: fx = {fx:.0f}, fy = {fy:.0f}"
             found.append(Finding("focal lengths", evidence, "check fx and fy of `K`"))
@@ -106,10 +93,10 @@ def _lengths(rig: Rig) -> list[Finding]:
     centres = _centres(rig)
     pairs = [np.linalg.norm(centres[a] - centres[b]) for a, b in combinations(range(rig.num_views), 2)]
     widest, nearest = float(max(pairs)), int(np.argmin(pairs))
-    if not _SMALLEST_M < widest < _LARGEST_M:
+    if not EXTENT_M[0] <= widest <= EXTENT_M[1]:
         evidence = f"the cameras stand up to {widest:.3g} m apart, which is not the size of a rig for hands"
         fix = f"check the unit: in millimetres it would be {widest / 1000:.3g} m"
-        return [Finding("unit of the rig", evidence, fix if widest > _LARGEST_M else "check the unit")]
+        return [Finding("unit of the rig", evidence, fix if widest > EXTENT_M[1] else "check the unit")]
     a, b = list(combinations(range(rig.num_views), 2))[nearest]
     if pairs[nearest] < 0.01 * widest and not _duplicates(rig):
         evidence = (

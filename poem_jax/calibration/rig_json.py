@@ -54,19 +54,25 @@ _CAMERA_KEYS = {"name", "width", "height", "K", "R", "t", *DISTORTION_KEYS}
 _log = logging.getLogger(__name__)
 
 
-def read_rig(path: str | os.PathLike, *, unit: str | float | None = None) -> Rig:
+def read_rig(
+    path: str | os.PathLike,
+    *,
+    unit: str | float | None = None,
+    size_wh: tuple[int, int] | None = None,
+) -> Rig:
     """Read `rig.json` into metres and the house's pixel convention.
 
     Args:
         path: The file.
         unit: Of its lengths, in place of what the file says (`units.metres_of`).
+        size_wh: What all its images must have; None = anything.
 
     Raises:
         FileNotFoundError: No such file.
         ValueError: Not JSON, a key comes twice or is missing, the unit is missing or unknown, a name or a
-            camera comes twice, a value is not finite, `R` is no rotation, `K` belongs to another resolution,
-            or a key says something of the lens that is not read. The message names file,
-            camera, what was expected and what was found.
+            camera comes twice, a value is not finite, a size is not the given one, `R` is no rotation, `K`
+            belongs to another resolution, or a key says something of the lens that is not read. The message
+            names file, camera, what was expected and what was found.
     """
     path = Path(path)
     content = read_json(path, what="rig file", allow_nan=True)
@@ -82,7 +88,8 @@ def read_rig(path: str | os.PathLike, *, unit: str | float | None = None) -> Rig
     if not isinstance(cropped, bool):
         raise ValueError(f"{path}: `cropped` must be true or false; got {short(cropped)}")
     found = [_camera(camera, name, fisheye, path) for camera, name in zip(cameras, names, strict=True)]
-    rig = rig_of(Calibration(found, known), path, "our rig.json", unit=unit, cropped=cropped)
+    calibration = Calibration(found, known)
+    rig = rig_of(calibration, path, "our rig.json", unit=unit, size_wh=size_wh, cropped=cropped)
     _warn_of_keys(content, path)
     return rig
 

@@ -18,8 +18,8 @@ _UNIT_NAMES = {
     for unit, symbol in _SYMBOLS.items()
     for name in (symbol, unit, f"{unit}s", unit.replace("metre", "meter"), unit.replace("metre", "meters"))
 } | {"inches": "inch"}
-_NEAREST = 0.03
-"""Metres between the farthest two cameras of a rig, below which its unit is doubted."""
+EXTENT_M = (0.03, MAX_CAMERA_DISTANCE)
+"""Between the farthest two cameras of a rig: beyond these limits its unit is doubted."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ def customary_metres(
     believed = [
         unit
         for unit, distance in zip(customs, apart, strict=True)
-        if farthest == 0 or _NEAREST <= distance <= MAX_CAMERA_DISTANCE
+        if farthest == 0 or EXTENT_M[0] <= distance <= EXTENT_M[1]
     ]
     if not believed:
         tried = " and ".join(f"{d:.3g} m if in {unit}s" for unit, d in zip(customs, apart, strict=True))

@@ -1,6 +1,7 @@
 """Write a rig in the format of another tool."""
 
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -53,6 +54,25 @@ def write_calibration(path: str | os.PathLike, rig: Rig, format: str | None = No
         ValueError: no such format, an ending of another, or a camera that the format cannot hold, by name.
     """
     path = Path(path)
+    _writer(path, format).write(path, rig)
+    return path
+
+
+def files_written(path: str | os.PathLike, rig: Rig, format: str | None = None) -> list[Path]:
+    """Return the files that `write_calibration` would make or replace, and write none of them.
+
+    Raises: ValueError: as `write_calibration`.
+    """
+    path = Path(path)
+    writer = _writer(path, format)
+    with tempfile.TemporaryDirectory() as folder:
+        writer.write(Path(folder, path.name) if writer.suffixes else Path(folder), rig)
+        names = sorted(file.name for file in Path(folder).iterdir())
+    return [(path.parent if writer.suffixes else path) / name for name in names]
+
+
+def _writer(path: Path, format: str | None) -> _Writer:
+    """Return what writes a format, if `path` can be one of it."""
     if format is None:
         format = next((name for name in FORMATS if path.suffix.lower() in _WRITERS[name].suffixes), None)
         if format is None:
@@ -66,5 +86,4 @@ def write_calibration(path: str | os.PathLike, rig: Rig, format: str | None = No
         raise ValueError(f"{path}: a file of the format {format} ends with {' or '.join(writer.suffixes)}")
     if not writer.suffixes and path.exists() and not path.is_dir():
         raise ValueError(f"{path}: the format {format} is a folder of files, and this is a file")
-    writer.write(path, rig)
-    return path
+    return writer

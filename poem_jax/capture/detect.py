@@ -96,8 +96,8 @@ def detect_hands(
 def describe_search(moments: Moments, rig: Rig, timing: Timing, *, max_hands: int, video: bool) -> str:
     """Say in one line what is searched and how: what was found by the same search can be used again.
 
-    Files count as the same where names, sizes and times of their last change are. Where the part of the take
-    ends does not matter: a longer search goes on from a shorter one.
+    The files are those of the whole take, and the same where names, sizes and times of their last change are.
+    Where the part of the take ends does not matter: a longer search goes on from a shorter one.
     """
     import poem_jax
 

@@ -5,6 +5,7 @@ hand. The file begins with one line that says what is searched. It only grows, f
 whatever ends a search leaves all frames before, and a cut last one is dropped.
 """
 
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,6 +32,8 @@ _HAND = np.dtype(
 )
 _FIRST_ROOM = 256
 _MAX_HEADER_BYTES = 2**16
+
+_log = logging.getLogger(__name__)
 
 
 class Detections(Sequence[Found]):
@@ -114,22 +117,28 @@ class Detections(Sequence[Found]):
 
 
 class SearchFile:
-    """The file of a search; what it has of the same search is taken up again."""
+    """The file of a search; what it has of the same search is taken up again.
+
+    That of another search is moved aside, to a name with `.old` behind, from where it is taken up as well.
+    """
 
     def __init__(self, path: Path, search: str) -> None:
         """`search`: what is searched and how, in one line."""
         self.path, self._header = path, search.encode() + b"\n"
+        self._old = path.with_name(f"{path.name}.old")
         self._stream: IO[bytes] | None = None
 
     def holds_another_search(self) -> bool:
-        """Tell whether there is a file, of other inputs or options."""
-        return self.path.is_file() and not self._is_ours()
+        """Tell whether there is a file, of other inputs or options, and none of this search."""
+        return self.path.is_file() and not self._is_ours(self.path) and not self._is_ours(self._old)
 
     def take_up(self, num_views: int) -> Detections:
         """Return what was found before, none where there is nothing, and make ready to add to it."""
         found = Detections(num_views)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self._is_ours():
+        if not self._is_ours(self.path):
+            self._make_room()
+        if self._is_ours(self.path):
             self._stream = self.path.open("r+b")
             self._stream.seek(len(self._header))
             end = found.read(self._stream)
@@ -155,11 +164,31 @@ class SearchFile:
             if is_empty:
                 os.unlink(self.path)
 
-    def _is_ours(self) -> bool:
-        if not self.path.is_file():
+    def _make_room(self) -> None:
+        """Move the file of another search aside, and one of this search that lies there back."""
+        returning = self.path.with_name(f"{self.path.name}.new")
+        comes_back = self._is_ours(self._old)
+        if comes_back:
+            os.replace(self._old, returning)
+        if _holds_frames(self.path):
+            os.replace(self.path, self._old)
+            _log.info("%s was of another search, and is kept as %s", self.path, self._old)
+        if comes_back:
+            os.replace(returning, self.path)
+
+    def _is_ours(self, path: Path) -> bool:
+        if not path.is_file():
             return False
-        with self.path.open("rb") as stream:
+        with path.open("rb") as stream:
             return stream.readline(_MAX_HEADER_BYTES) == self._header
+
+
+def _holds_frames(path: Path) -> bool:
+    """Tell whether a file has more than the line that says what is searched."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.readline(_MAX_HEADER_BYTES).endswith(b"\n") and stream.read(1) != b""
 
 
 def _record(hand: DetectedHand) -> tuple:

@@ -32,6 +32,8 @@ class Moments(NamedTuple):
     """Whether they lie in videos."""
     sync: Path | None = None
     """The file of offsets and rates, where there is one."""
+    whole: Sequence[FramePaths] | None = None
+    """All moments of the take, where these are a part of it."""
 
     @property
     def follow_closely(self) -> bool:
@@ -39,9 +41,10 @@ class Moments(NamedTuple):
         return self.is_video and (self.frames_per_second or 0.0) >= _FOLLOWED_FROM
 
     def files(self) -> list[Path]:
-        """Return the files that they are read from, each once."""
+        """Return the files of the whole take, each once."""
+        frames = self.frames if self.whole is None else self.whole
         found: dict[Path, None] = {} if self.sync is None else {self.sync: None}
-        for frame in [self.frames[0]] if self.is_video else self.frames:
+        for frame in [frames[0]] if self.is_video else frames:
             for image in frame.images:
                 if image is not None:
                     found[image.video.path if isinstance(image, VideoFrame) else image] = None
@@ -147,7 +150,8 @@ def _part(moments: Moments, timing: Timing) -> Moments:
         return moments
     rate = moments.frames_per_second
     rate = None if rate is None else rate / timing.every
-    return moments._replace(frames=moments.frames[start : end : timing.every], frames_per_second=rate)
+    part = moments.frames[start : end : timing.every]
+    return moments._replace(frames=part, frames_per_second=rate, whole=moments.frames)
 
 
 def _index(place: Place, moments: Moments, option: str) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from poem_jax.calibration.epipolar import ideal_keypoints, pair_distances_px
 from poem_jax.calibration.refinement import MAX_HANDS, adjust_extrinsics
 from poem_jax.calibration.time_offsets import find_offsets, shifted
+from poem_jax.calibration.time_words import LATE_FRAMES
 from poem_jax.geometry.rig import Rig
 from poem_jax.geometry.transforms import axis_angle_from_rotation, invert_rigid
 from poem_jax.hand.topology import BONES
@@ -24,7 +25,9 @@ MIN_GAIN = 0.02
 """Of the held-out error: by less a rig is not better."""
 
 _HELD_OUT = 3
-"""Every third frame."""
+"""Every third frame, or every third run of them."""
+_RUN = 5
+"""Frames of a run, where offsets in time are found: they need the neighbours of a frame."""
 _CAP_SHARE = 0.04
 
 
@@ -64,19 +67,21 @@ def refine_rig(
         rig: The cameras; K and the lenses are kept.
         keypoints_px: In pixels of the raw images, OpenPose order; NaN = unseen.
         time_s: When the frames were taken, seconds; None = they are evenly spaced, in the order of time.
-        offsets: Undo the cameras' offsets in time too.
+        offsets: Undo the cameras' offsets in time too, of `LATE_FRAMES` or more; they are found on the frames
+            that the rig is adjusted to.
 
     Raises: ValueError: too few hands, or too few key points of a camera.
     """
     given_px = np.asarray(keypoints_px, np.float64)
-    held_out = np.arange(len(given_px)) % _HELD_OUT == 1
+    held_out = np.arange(len(given_px)) // (_RUN if offsets else 1) % _HELD_OUT == 1
+    used_px = np.where(held_out[:, None, None, None, None], np.nan, given_px)
     _check_enough(rig, given_px, held_out)
     late = np.zeros(rig.num_views)
     new = rig
     aligned_px = given_px
     for _ in range(2 if offsets else 1):
-        if offsets and (found := find_offsets(new, given_px, time_s)) is not None:
-            late = found.frames
+        if offsets and (found := find_offsets(new, used_px, time_s)) is not None:
+            late = np.where(np.abs(found.frames) < LATE_FRAMES, 0.0, found.frames)
             aligned_px = shifted(given_px, late, time_s)
         new = _adjusted(rig, aligned_px[~held_out])
     change = new.T_cam_from_world @ invert_rigid(rig.T_cam_from_world)
@@ -115,7 +120,7 @@ def _check_enough(rig: Rig, keypoints_px: Array, held_out: Bool[Array, " frame"]
         if count < MIN_HANDS:
             raise ValueError(
                 f"too little to refine a rig: expected at least {MIN_HANDS} hands {what} that two cameras "
-                f"see, got {count} (every third of {len(keypoints_px)} frames is held out); give a longer "
+                f"see, got {count} (a third of {len(keypoints_px)} frames is held out); give a longer "
                 "take"
             )
     for name, count in zip(rig.names, shared[~held_out].sum((0, 1, 3)), strict=True):

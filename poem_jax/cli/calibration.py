@@ -98,16 +98,25 @@ class Convert:
     def run(self) -> int:
         """Write the calibration and say what it holds."""
         from poem_jax.calibration.read_calibration import read_calibration
-        from poem_jax.calibration.write_calibration import FORMATS, write_calibration
-        from poem_jax.io.writable import check_inputs_stay
+        from poem_jax.calibration.write_calibration import FORMATS, files_written, write_calibration
 
         if self.format is not None and self.format not in FORMATS:
             raise ValueError(f"--format must be one of {', '.join(FORMATS)}; got {self.format!r}")
-        check_inputs_stay([self.out], [self.source])
         rig = read_calibration(self.source, unit=self.unit, image_size=self.image_size)
+        self._check_source_stays(files_written(self.out, rig, self.format))
         written = write_calibration(self.out, rig, self.format)
         print(f"{rig.num_views} cameras ({', '.join(rig.names)}) written to {written}")
         return 0
+
+    def _check_source_stays(self, written: Iterable[Path]) -> None:
+        """Insist that nothing is replaced beside what is read: a calibration may be of several files."""
+        folder = self.source if self.source.is_dir() else self.source.parent
+        beside = [path for path in folder.iterdir() if path.exists()]
+        for file in (path for path in written if path.exists()):
+            if any(file.samefile(path) for path in beside):
+                where = f"lies {'in' if folder == self.source else 'beside'} {self.source}, which"
+                where = "" if file.samefile(self.source) else f"{where} "
+                raise ValueError(f"{file} would be replaced, and {where}is read; give another OUT")
 
 
 @dataclass(frozen=True)

@@ -180,7 +180,7 @@ FAULTS = {
         "sign of the lens",
         "wrong sign",
     ),
-    "one camera late": (late(1), "time offset", "'{2}' +1.0"),
+    "one camera late": (late(1), "time offset", "'{2}' +"),
 }
 """How it is planted, the name of the finding, and what its text holds ({0} = name of the first camera)."""
 

@@ -131,6 +131,16 @@ def test_a_unit_that_is_told_goes_before_the_file_s(tmp_path, unit, caplog):
         read_calibration(path, unit="furlong")
 
 
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_size_that_is_told_must_be_the_file_s(tmp_path, name):
+    rig = ring_of(NO_LENS, NO_LENS)
+    path = write_calibration(path_of(tmp_path, name), rig, name)
+    width, height = map(int, rig.size_wh[0])
+    assert_same(read_calibration(path, image_size=(width, height)), rig, name)
+    with pytest.raises(ValueError, match=rf"are {width} x {height} by the file; got 64 x 48: leave the size"):
+        read_calibration(path, image_size=(64, 48))
+
+
 @pytest.mark.parametrize(("scale", "unit"), [(1000.0, "millimetre"), (1.0, "metre")])
 def test_the_custom_under_which_cameras_stand_apart_as_cameras_do(tmp_path, scale, unit, caplog):
     """anipose says no unit: its board's, which is millimetres mostly, and metres with Pose2Sim."""

@@ -2,6 +2,7 @@
 
 import logging
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
-from tests.videos import cut, damage, number_of, write_video
+from tests.videos import cut, damage, number_of, picture, write_video
 
 FRAMES = 14
 SIZE_WH = (240, 180)
@@ -130,6 +131,42 @@ def test_another_search_begins_anew(search, folder, rig, capsys):
 def test_a_longer_search_goes_on_from_a_shorter_one(search):
     search("--end", "1", stop_at=5)
     assert search()[1].images == 3 * (FRAMES - 5)
+
+
+def test_a_longer_search_goes_on_in_images_too(search, folder, rig):
+    (folder / "sync.json").write_text('{"frames_per_second": 10}')
+    for seed, camera in enumerate(rig.names):
+        (folder / f"{camera}.avi").unlink()
+        (folder / camera).mkdir()
+        for index in range(FRAMES):
+            file = folder / camera / f"{index:04d}.png"
+            cv2.imwrite(str(file), picture(index, size_wh=SIZE_WH, seed=seed))
+    assert search("--end", "5f")[0] == 0
+    code, seen = search()
+    assert (code, seen.images) == (0, 3 * (FRAMES - 5))
+    code, seen = search("--end", "0.7")
+    assert (code, seen.images) == (0, 0)
+
+
+def test_another_search_is_kept_and_comes_back(search, tmp_path, caplog):
+    kept, old = tmp_path / "found.search", tmp_path / "found.search.old"
+    search(stop_at=9)
+    first = kept.read_bytes()
+    search("--max-hands", "1", stop_at=5)
+    second = kept.read_bytes()
+    assert old.read_bytes() == first
+    assert f"{kept} was of another search, and is kept as {old}" in caplog.text
+    code, seen = search()
+    assert (code, seen.images) == (0, 3 * (FRAMES - 9))
+    assert old.read_bytes() == second
+    whole = kept.read_bytes()
+    assert whole.startswith(first)
+    # A search that found nothing yet takes no room from one that did.
+    kept.write_bytes(b"cut short")
+    old.write_bytes(whole)
+    search("--max-hands", "1", stop_at=5)
+    assert old.read_bytes() == whole
+    assert sorted(tmp_path.glob("found.search*")) == [kept, old]
 
 
 def test_what_was_found_is_not_searched_for_again(folder, tmp_path, rig, monkeypatch, caplog):

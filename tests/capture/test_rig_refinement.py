@@ -91,6 +91,26 @@ def test_offsets_in_time_are_found_with_the_places():
     assert metres.max() < 0.002
 
 
+@pytest.mark.slow
+def test_a_good_rig_has_no_offsets_in_time(take):
+    rig, uv = take
+    refined = refine_rig(rig, uv, offsets=True)
+    np.testing.assert_array_equal(refined.frames_late, 0)
+    assert not refined.helps
+
+
+@pytest.mark.slow
+def test_the_frames_that_are_held_out_do_not_set_the_offsets(take):
+    rig, uv = take
+    given = refine_rig(rig, uv, offsets=True)
+    others = moving_take((0.0, 0.0, 1.5, 0.0), frames=90, noise_px=0.5)[1]
+    held_out = np.arange(90) // 5 % 3 == 1
+    spoiled = refine_rig(rig, np.where(held_out[:, None, None, None, None], others, uv), offsets=True)
+    np.testing.assert_array_equal(spoiled.frames_late, given.frames_late)
+    np.testing.assert_array_equal(spoiled.rig.T_cam_from_world, given.rig.T_cam_from_world)
+    assert not np.allclose(spoiled.held_out_px, given.held_out_px)
+
+
 def test_too_little_is_refused(take):
     rig, uv = take
     with pytest.raises(ValueError, match=r"at least 10 hands.*got 4.*longer take"):

@@ -6,10 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.calibration.read_calibration import read_calibration
 from poem_jax.calibration.rig_json import read_rig, write_rig
+from poem_jax.calibration.write_calibration import write_calibration
 from poem_jax.capture import detect
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, read_boxes, write_boxes
 from poem_jax.cli.run import main, parse
+from tests.calibration.conftest import make_ring
 from tests.calibration.planted_faults import FAULTS
 from tests.calibration.test_linter import moving_take
 from tests.capture.test_rig_refinement import off, touched
@@ -112,3 +115,52 @@ def test_the_arguments_of_convert():
     command = parse(["calibration", "convert", "in.toml", "out.json", "--unit", "millimetre"])
     assert command.action.unit == "millimetre"
     assert command.action.format is None
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("made", "format", "arguments", "lost"),
+    [
+        ("calib", "easymocap", ("calib/intri.yml", "calib/extri.yml"), "calib/extri.yml"),
+        ("calib/rig.json", "rig", ("calib", "calib/rig.json"), "calib/rig.json"),
+        ("calib", "colmap", ("calib/cameras.txt", "calib", "--format", "colmap"), "calib/cameras.txt"),
+        ("calib", "colmap", ("calib", "link", "--format", "colmap"), "link/cameras.txt"),
+        (
+            "calib/rig.toml",
+            "anipose",
+            ("calib/rig.toml", "calib", "--format", "colmap"),
+            "calib/points3D.txt",
+        ),
+        ("calib/rig.toml", "anipose", ("link.toml", "calib/rig.toml"), "calib/rig.toml"),
+    ],
+)
+def test_convert_replaces_nothing_beside_what_it_reads(
+    tmp_path, monkeypatch, capsys, made, format, arguments, lost
+):
+    monkeypatch.chdir(tmp_path)
+    write_calibration(made, make_ring(3), format)
+    (tmp_path / "calib" / "points3D.txt").write_text("1 0 0 1 255 0 0 0.5\n")
+    (tmp_path / "link").symlink_to("calib")
+    (tmp_path / "link.toml").symlink_to("calib/rig.toml")
+    before = contents(tmp_path)
+    assert poem("convert", *arguments) == 2
+    error = capsys.readouterr().err
+    assert f"{lost} would be replaced" in error
+    assert "give another OUT" in error
+    assert contents(tmp_path) == before
+
+
+def test_convert_writes_beside_what_it_reads_and_over_what_it_made(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rig = make_ring(3)
+    write_calibration("calib", rig, "easymocap")
+    for out in ("calib/rig.json", "out/rig.toml", "out/rig.toml"):
+        assert poem("convert", "calib/intri.yml", out) == 0
+        np.testing.assert_allclose(read_calibration(out).T_cam_from_world, rig.T_cam_from_world, atol=1e-9)
+    for _ in range(2):
+        assert poem("convert", "out/rig.toml", ".", "--format", "colmap") == 0
+    assert (tmp_path / "cameras.txt").is_file()
+    assert poem("convert", "out/rig.toml", "out/rig") == 2
