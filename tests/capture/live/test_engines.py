@@ -7,11 +7,12 @@ import pytest
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.capture.boxes_file import boxes_from_keypoints
-from poem_jax.capture.fit import NOT_FITTED, fit_config, hands_of
+from poem_jax.capture.fit import NOT_FITTED, fit_config
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.live.engines import MOMENTS_FOR_SHAPE, live_fit
 from poem_jax.fitting import Observations, fit_take, keypoint_model
 from poem_jax.fitting.lm import ShapeMode
+from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from tests.capture.live.fake_cameras import RIG, SIDES, seen_hands, true_joints
 
