@@ -87,7 +87,7 @@ def test_the_scenes_notice_broken_code(monkeypatch, broken):
     elif broken == "sides":
         monkeypatch.setattr("poem_jax.capture.sightings.MAX_VOTE", 0.0)
     else:
-        monkeypatch.setattr(hand_tracks, "_distance", lambda a, b: 0.0)
+        monkeypatch.setattr(hand_tracks, "mean_distance", lambda a, b: 0.0)
     kinds = [planted.two_people_four_hands] if broken == "motion" else FEW
     rigs = ("two", "four") if broken == "motion" else ("four",)
     scenes = [planted.planted(kind, rig, 0) for kind in kinds for rig in rigs]
