@@ -91,18 +91,21 @@ def test_offsets_in_time_are_found_with_the_places():
     assert metres.max() < 0.002
 
 
-@pytest.mark.slow
-def test_a_good_rig_has_no_offsets_in_time(take):
-    rig, uv = take
-    refined = refine_rig(rig, uv, offsets=True)
-    np.testing.assert_array_equal(refined.frames_late, 0)
-    assert not refined.helps
+@pytest.fixture(scope="module")
+def of_a_good_rig(take):
+    return refine_rig(*take, offsets=True)
 
 
 @pytest.mark.slow
-def test_the_frames_that_are_held_out_do_not_set_the_offsets(take):
+def test_a_good_rig_has_no_offsets_in_time(of_a_good_rig):
+    np.testing.assert_array_equal(of_a_good_rig.frames_late, 0)
+    assert not of_a_good_rig.helps
+
+
+@pytest.mark.slow
+def test_the_frames_that_are_held_out_do_not_set_the_offsets(take, of_a_good_rig):
     rig, uv = take
-    given = refine_rig(rig, uv, offsets=True)
+    given = of_a_good_rig
     others = moving_take((0.0, 0.0, 1.5, 0.0), frames=90, noise_px=0.5)[1]
     held_out = np.arange(90) // 5 % 3 == 1
     spoiled = refine_rig(rig, np.where(held_out[:, None, None, None, None], others, uv), offsets=True)
