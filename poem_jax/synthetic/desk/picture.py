@@ -51,7 +51,7 @@ def take_picture(scene: Surface, lit: Lit, rig: Rig, view: int, seed: int) -> Pi
         seed: of the sensor's noise.
     """
     width, height = (int(side) * SUPERSAMPLE for side in rig.size_wh[view])
-    raster = rasterise(_through_lens(scene, rig, view), scene.faces, (height, width), near=_NEAR_M)
+    raster = rasterise(through_lens(scene, rig, view), scene.faces, (height, width), near=_NEAR_M)
     light = _shade(scene, lit, raster, _center(rig, view))
     light = cv2.resize(light, tuple(map(int, rig.size_wh[view])), interpolation=cv2.INTER_AREA)
     light = cv2.GaussianBlur(light, (0, 0), _BLUR_PX)
@@ -60,7 +60,7 @@ def take_picture(scene: Surface, lit: Lit, rig: Rig, view: int, seed: int) -> Pi
     return Picture(pixels, raster.depth)
 
 
-def _through_lens(scene: Surface, rig: Rig, view: int) -> Float[Array, "vert 3"]:
+def through_lens(scene: Surface, rig: Rig, view: int) -> Float[Array, "vert 3"]:
     """Return vertices in samples of the picture, and their depth; 0 where the lens does not show them."""
     points = transform_points(rig.T_cam_from_world[view], scene.vertices)
     depth = points[:, 2]

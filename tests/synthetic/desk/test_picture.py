@@ -6,9 +6,10 @@ import pytest
 from poem_jax.data.lens import project_raw
 from poem_jax.hand.template import default_hand
 from poem_jax.render.zbuffer import rasterise
+from poem_jax.synthetic.desk.body import body_surface
 from poem_jax.synthetic.desk.cameras import SIZE_WH, desk_rig, frame_times
 from poem_jax.synthetic.desk.motion import SIDES, hands_at
-from poem_jax.synthetic.desk.picture import SUPERSAMPLE
+from poem_jax.synthetic.desk.picture import SUPERSAMPLE, through_lens
 from poem_jax.synthetic.desk.take import desk_pictures
 
 FRAME = 15
@@ -34,6 +35,17 @@ def true_depths():
     return np.array(
         [[depth(view, *hand) for hand in zip(SIDES, hands.vertices_world, strict=True)] for view in VIEWS]
     )
+
+
+def test_surfaces_go_through_the_lens_that_the_calibration_tells():
+    rig, scene = desk_rig(), body_surface(hands_at(0.0))
+    for view in range(rig.num_views):
+        seen = through_lens(scene, rig, view)
+        pixels, points_cam = project_raw(rig, view, scene.vertices)
+        drawn = seen[:, 2] > 0
+        assert drawn.mean() > 0.9
+        np.testing.assert_allclose(seen[drawn, :2] / SUPERSAMPLE, pixels[drawn], atol=1e-6)
+        np.testing.assert_allclose(seen[drawn, 2], points_cam[drawn, 2], atol=1e-9)
 
 
 def test_the_true_hands_are_what_is_drawn(pictures, true_depths):
