@@ -6,6 +6,11 @@ A row is a function that prints what it measured; `ROWS` lists them.
                 reference material, with caliscope_4cam_video and caliscope_4cam_hands)
     fit         frames a second of the fit of 4 cameras and two hands, key points given, files written
     smoothing   how much hands tremble, and how late they are, before they are smoothed and after
+    formats     how far the files of one rig are apart, in pixels
+    linter      planted faults of calibrations that are named right
+    videos      `poem reconstruct` on four real videos with seven files of their rig, then the lengths of
+                bones and of the squares of the board that is in view
+    live        how far `poem live` is behind, on the demo's videos
     memory      memory of a search, then of a fit, after 200 and after 2,000 frames of a synthetic take
 """
 
@@ -20,6 +25,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from capture_real import formats, linter, live, videos
 from capture_smoothing import smoothing
 
 from poem_jax.calibration.rig_json import read_rig, write_rig
@@ -205,6 +211,10 @@ ROWS: dict[str, Callable[[Path], None]] = {
     "fit": fit_row,
     "memory": memory,
     "smoothing": lambda _: smoothing(),
+    "formats": formats,
+    "linter": linter,
+    "videos": videos,
+    "live": live,
 }
 """Every row takes the folder of real data."""
 
@@ -216,7 +226,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of real data")
     given = parser.parse_args()
     use_compilation_cache()
-    logging.basicConfig(level=logging.ERROR)
+    logging.disable(logging.WARNING)
     for name, row in ROWS.items():
         if given.only in (None, name):
             row(given.data)

@@ -28,6 +28,7 @@ from poem_jax.calibration.camera_values import (
 )
 from poem_jax.calibration.documents import Document, Syntax
 from poem_jax.calibration.lens_values import lens_terms
+from poem_jax.calibration.opencv_storage import as_lists
 from poem_jax.calibration.refusals import check_no_fisheye
 from poem_jax.geometry.distortion import shortest_terms
 from poem_jax.geometry.rig import Rig
@@ -64,7 +65,7 @@ def read_easymocap(documents: Sequence[Document]) -> Calibration:
             found = documents[0].path
             raise ValueError(f"{found}: EasyMocap's {part}, {what}, is missing: put it beside {found.name}")
     intri, extri = (
-        {key: _as_lists(value) for key, value in parts[p].content().items()} for p in (INTRI, EXTRI)
+        {key: as_lists(value) for key, value in parts[p].content().items()} for p in (INTRI, EXTRI)
     )
     paths = [str(parts[part].path) for part in (INTRI, EXTRI)]
     names = [_names(content, path) for content, path in zip((intri, extri), paths, strict=True)]
@@ -159,7 +160,3 @@ def _rotation(name: str, extri: Mapping[str, Any], where: str) -> Array:
             f"{np.abs(of_vector - of_matrix).max():.2g}: correct one of them, or leave it out"
         )
     return of_matrix
-
-
-def _as_lists(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value

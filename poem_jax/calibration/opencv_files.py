@@ -24,6 +24,7 @@ from poem_jax.calibration.camera_values import (
 )
 from poem_jax.calibration.documents import Document, Syntax
 from poem_jax.calibration.lens_values import lens_terms, says_fisheye
+from poem_jax.calibration.opencv_storage import as_lists
 from poem_jax.calibration.units import known_unit
 from poem_jax.geometry.distortion import shortest_terms
 from poem_jax.geometry.rig import Rig
@@ -123,8 +124,8 @@ def _stereo(content: Mapping[str, Any], path: Path) -> list[FileCamera]:
     cameras = []
     for number_, T in (("1", np.eye(4)), ("2", pose(*_place(content, str(path))))):
         where = f"{path}: camera {number_}"
-        K = from_centres(intrinsics(_as_lists(content[f"M{number_}"]), where))
-        dist = lens_terms(_as_lists(content[f"D{number_}"]), f"{where}: `D{number_}`")
+        K = from_centres(intrinsics(as_lists(content[f"M{number_}"]), where))
+        dist = lens_terms(as_lists(content[f"D{number_}"]), f"{where}: `D{number_}`")
         cameras.append(FileCamera(f"cam_{number_}", _size(content, where), K, dist, T))
     return cameras
 
@@ -134,15 +135,15 @@ def _camera(held: Mapping[str, Any], name: str, path: Path) -> FileCamera:
     fisheye = held.get("fisheye", 0)
     model = {key: value for key, value in held.items() if key not in (*_MATRIX, *_LENS, "fisheye")}
     is_fish = says_fisheye(model, where) or fisheye in (1, "true", "True", True)
-    K = from_centres(intrinsics(_as_lists(_one_of(held, _MATRIX, where)), where))
+    K = from_centres(intrinsics(as_lists(_one_of(held, _MATRIX, where)), where))
     terms = next((held[key] for key in _LENS if key in held), [])
-    dist = lens_terms(_as_lists(terms), f"{where}: its distortion", is_fish)
+    dist = lens_terms(as_lists(terms), f"{where}: its distortion", is_fish)
     return FileCamera(name, _size(held, where), K, dist, pose(*_place(held, where)))
 
 
 def _place(held: Mapping[str, Any], where: str) -> tuple[Array, Array]:
-    R = rotation_or_vector(_as_lists(_one_of(held, _ROTATION, where)), where)
-    return R, translation(_as_lists(_one_of(held, _TRANSLATION, where)), where)
+    R = rotation_or_vector(as_lists(_one_of(held, _ROTATION, where)), where)
+    return R, translation(as_lists(_one_of(held, _TRANSLATION, where)), where)
 
 
 def _size(held: Mapping[str, Any], where: str) -> tuple[int, int] | None:
@@ -164,7 +165,3 @@ def _one_of(held: Mapping[str, Any], names: Sequence[str], where: str) -> Any:
 
 def _map(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
-
-
-def _as_lists(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value

@@ -83,6 +83,11 @@ def _element(element: ElementTree.Element, depth: int, source: str) -> Any:
     return values[0] if len(values) == 1 else values
 
 
+def as_lists(value: Any) -> Any:
+    """Return a matrix as nested lists, anything else as it is."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
 def _matrix(fields: Mapping[str, Any]) -> Array:
     """Return a matrix from rows, cols and data.
 

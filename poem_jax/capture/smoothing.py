@@ -24,8 +24,8 @@ from poem_jax.hand.pair import Hands
 from poem_jax.hand.topology import NUM_VERTICES, ROOT_JOINT
 from poem_jax.typing import Array
 
-LIVE, BOTH_WAYS = FilterConfig(), FilterConfig()
-"""The filter of a live picture; the one that is run forwards and backwards."""
+FILTER = FilterConfig()
+"""Of a live picture; offline the same runs forwards and backwards."""
 
 _AHEAD, _TOGETHER = 8, 4
 """Frames that are looked ahead at, and that are smoothed at a time: so many are held, with their images."""
@@ -98,7 +98,7 @@ class Smoother:
             return
         moments = self._moments(frames)
         if smoothing.mode == "causal":
-            moments = _held(_forwards(moments, LIVE), smoothing.bridge_s)
+            moments = _held(_forwards(moments, FILTER), smoothing.bridge_s)
         else:
             moments = _bridged(_both_ways(moments), smoothing.bridge_s)
         bridged = 0
@@ -143,7 +143,7 @@ def _both_ways(moments: Iterable[_Moment]) -> Iterator[_Moment]:
             seen.append(moment.hands)
             yield moment
 
-    for moment in _forwards(kept(), BOTH_WAYS):
+    for moment in _forwards(kept(), FILTER):
         waiting.append(moment)
         if len(waiting) == _TOGETHER + _AHEAD:
             yield from _met(waiting, seen)[:_TOGETHER]
@@ -157,7 +157,7 @@ def _met(forwards: Sequence[_Moment], seen: Sequence[Sequence[MovingHand | None]
         moment._replace(time_s=-moment.time_s, hands=hands)
         for moment, hands in zip(reversed(forwards), reversed(seen), strict=True)
     )
-    backwards = reversed(list(_forwards(turned, BOTH_WAYS)))
+    backwards = reversed(list(_forwards(turned, FILTER)))
     return [
         one._replace(hands=tuple(map(_half_way, one.hands, other.hands)))
         for one, other in zip(forwards, backwards, strict=True)

@@ -1,7 +1,8 @@
 """The moments of a take whose cameras wrote a video each.
 
-They are the frames of the slowest camera, between the latest beginning and the earliest end; of every other
-camera the nearest frame is taken, up to half a period away.
+They come at the rate of the slowest camera, evenly, between the latest beginning and the earliest end. Of
+every camera the frame nearest by its time stamps is taken, up to half a period away: the slowest camera's own
+frame lies at the moment itself unless its rate varies.
 """
 
 import logging
