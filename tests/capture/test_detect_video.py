@@ -10,6 +10,8 @@ from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture import detect
 from poem_jax.capture.boxes_file import read_boxes
 from poem_jax.capture.detections import Detections, SearchFile
+from poem_jax.capture.take import read_keypoint_take, read_take
+from poem_jax.capture.timing import Timing
 from poem_jax.cli import main
 from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
@@ -84,6 +86,22 @@ def test_offsets_and_part_of_a_take(search, tmp_path):
     assert search("--offsets", "front=0.3", "--start", "0.5", "--end", "9f", "--every", "2")[0] == 0
     np.testing.assert_array_equal(numbers(tmp_path / "found.npz"), [[8, 5, 8], [10, 7, 10]])
     np.testing.assert_allclose(read_boxes(tmp_path / "found.npz").time_s, [0.5, 0.7])
+
+
+def test_images_beside_key_points_are_those_in_which_they_were_found(search, folder, tmp_path, caplog):
+    found = tmp_path / "found.npz"
+    search("--offsets", "front=0.3")
+    np.testing.assert_allclose(read_boxes(found).offsets_s, [0, 0.3, 0])
+    frames = list(read_keypoint_take(found, images=folder).frames)
+    assert "images are taken under the offsets" in caplog.text
+    shown = [[number_of(image.read()) for image in frame.image_files] for frame in frames]
+    np.testing.assert_array_equal(shown, numbers(found))
+    caplog.clear()
+    same = read_take(folder, boxes=found, timing=Timing({"front": 0.3}))
+    assert [frame.name for frame in same.frames] == [frame.name for frame in frames]
+    assert "images are taken" not in caplog.text
+    with pytest.raises(ValueError, match=r"found under other offsets \(front=0.3, not 0.1 s\)"):
+        read_take(folder, boxes=found, timing=Timing({"front": 0.1}))
 
 
 def test_a_search_that_is_stopped_goes_on(search, tmp_path, capsys, caplog):
