@@ -65,8 +65,9 @@ def find_keypoints(
     max_hands: int,
     video: bool,
     moments: Moments,
+    by_side: bool = False,
 ) -> None:
-    """Write the key points of a capture to the file `out`, and print what was found.
+    """Write the key points of a capture to the file `out`, and print what was found; options as in `Detect`.
 
     What was found in each image of a take stays beside it, so that nothing is searched twice: not after an
     interruption, and not for a better calibration.
@@ -104,6 +105,7 @@ def find_keypoints(
             rig,
             max_hands=max_hands,
             video=video,
+            by_side=by_side,
             file=file,
             when_stopped=lambda hands: write_boxes(part, found_at(hands, take)),
         )
