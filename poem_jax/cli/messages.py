@@ -72,15 +72,20 @@ def _written_since(out: Path, start: float) -> bool:
 
 def print_files(written: "Written", out: Path) -> None:
     """List the files folder by folder; frames beyond the third in one line."""
+    from poem_jax.capture.write import CAPTURE, OVERLAYS
+
     folders: dict[Path, list[str]] = {}
     for path in written.files:
         folders.setdefault(path.parent, []).append(path.name)
-    frames = [folder for folder in folders if folder != out]
+    of_take = [out, *(out / name for name in (OVERLAYS, CAPTURE))]
+    frames = [folder for folder in folders if folder not in of_take]
     for folder in frames[:3]:
         print(f"{folder}/  {'  '.join(folders[folder])}")
     if len(frames) > 3:
         print(f"... and {len(frames) - 3} more frames like these")
-    print(f"{out}/  {'  '.join(folders.get(out, []))}")
+    for folder in reversed(of_take):
+        if folder in folders:
+            print(f"{folder}/  {'  '.join(folders[folder])}")
 
 
 def print_summary(report: dict[str, Any]) -> None:
