@@ -54,13 +54,14 @@ class _Formatter(logging.Formatter):
 
 @contextlib.contextmanager
 def tells_what_is_left(out: Path) -> Iterator[None]:
-    """When the block is stopped, say whether anything was written to the folder or file `out` so far."""
+    """When the block is stopped, or a file cannot be written, say whether anything is in `out` so far."""
     start = time.time()
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, OSError) as stop:
         written = _written_since(out, start)
-        say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
+        if written or isinstance(stop, KeyboardInterrupt):
+            say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
         raise
 
 
