@@ -54,13 +54,14 @@ class _Formatter(logging.Formatter):
 
 @contextlib.contextmanager
 def tells_what_is_left(out: Path) -> Iterator[None]:
-    """When the block is stopped, say whether anything was written to the folder or file `out` so far."""
+    """When the block is stopped, or a file cannot be written, say whether anything is in `out` so far."""
     start = time.time()
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, OSError) as stop:
         written = _written_since(out, start)
-        say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
+        if written or isinstance(stop, KeyboardInterrupt):
+            say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
         raise
 
 
@@ -72,15 +73,20 @@ def _written_since(out: Path, start: float) -> bool:
 
 def print_files(written: "Written", out: Path) -> None:
     """List the files folder by folder; frames beyond the third in one line."""
+    from poem_jax.capture.write import CAPTURE, OVERLAYS
+
     folders: dict[Path, list[str]] = {}
     for path in written.files:
         folders.setdefault(path.parent, []).append(path.name)
-    frames = [folder for folder in folders if folder != out]
+    of_take = [out, *(out / name for name in (OVERLAYS, CAPTURE))]
+    frames = [folder for folder in folders if folder not in of_take]
     for folder in frames[:3]:
         print(f"{folder}/  {'  '.join(folders[folder])}")
     if len(frames) > 3:
         print(f"... and {len(frames) - 3} more frames like these")
-    print(f"{out}/  {'  '.join(folders.get(out, []))}")
+    for folder in reversed(of_take):
+        if folder in folders:
+            print(f"{folder}/  {'  '.join(folders[folder])}")
 
 
 def print_summary(report: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """From arguments to an exit code: one command is read, run, and ends in one line whatever happens."""
 
+import errno
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -85,8 +86,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ModuleNotFoundError, FloatingPointError) as error:
         if command.debug:
             raise
-        print(f"poem: error: {error}", file=sys.stderr)
+        print(f"poem: error: {_told(error)}", file=sys.stderr)
         return USAGE_ERROR
+
+
+def _told(error: Exception) -> str:
+    """Return an error's text, in our words where the disk is full."""
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" at {error.filename}" if error.filename else ""
+        return f"the disk is full{where}: make room, or give another folder"
+    return str(error)
 
 
 def _run(command: Command) -> int:

@@ -304,7 +304,7 @@ def test_a_full_disk_leaves_what_was_found(search, tmp_path, monkeypatch, capsys
     with monkeypatch.context() as patched:
         patched.setattr(SearchFile, "add", add_until_full)
         assert search()[0] == 2
-    assert "No space left on device" in capsys.readouterr().err
+    assert "the disk is full: make room" in capsys.readouterr().err
     assert search()[1].images == 3 * (FRAMES - 7)
 
 
