@@ -111,5 +111,5 @@ def test_wrong_counts_are_refused(batch):
         drop_cameras(batch, 0, key=KEY)
     with pytest.raises(ValueError, match="`num_replaced` must be 0 to `num_views` = 3; got 4"):
         replace_cameras(batch, 3, 4, key=KEY)
-    with pytest.raises(ValueError, match="must not be negative; got -1.0 and 0.0"):
+    with pytest.raises(ValueError, match=r"must not be negative; got -1\.0 and 0\.0"):
         noisy_extrinsics(batch, -1.0, 0.0, key=KEY)
