@@ -5,7 +5,7 @@ What:      one trunk and first stage for all, those of the shipped model, frozen
            order, batch 8, Adam 4e-4 with a warm-up and a cosine, each system's own losses. Tested on new
            captures of that rig, and on two others (`poem eval --table synthetic`).
            By name: v2, v2-row-major, v1, v1-1stage, v1-wo-proj, v1-wo-pt, v1-g-emb, v1-gv-emb, pe-meshtr,
-           ftl-meshtr, mvp; a second seed with `--train.seed 1 --train.out runs/synthetic_table/NAME-1`.
+           ftl-meshtr, mvp. `make synthetic-table` trains all of them with two seeds.
 Hardware:  2 CPU cores at the lowest priority; the same command uses every GPU or TPU it finds.
 Time:      docs/tables.md.
 Expected:  docs/tables.md.
@@ -51,7 +51,7 @@ def _experiment(name: str, model: ModelConfig) -> TrainConfig:
             ema_decay=0.99,
         ),
         train=RunConfig(
-            steps=4000,
+            steps=2000,
             out=f"runs/synthetic_table/{name}",
             first_stage_from="shipped",
             checkpoint_every=200,

@@ -33,7 +33,7 @@ from poem_jax.models.poem_v1_config import (
 )
 from poem_jax.models.presets import TINY
 
-_WIDTH, _LAYERS, _BASIS, _NEIGHBOURS = 64, 3, 1024, 16
+_WIDTH, _LAYERS, _BASIS, _NEIGHBOURS = 64, 2, 512, 8
 _CUBOID = Cuboid((-0.4, -0.4, 0.4), (0.4, 0.4, 1.4))
 """Where hands are before the first camera of any of the rigs."""
 _MEAN_ROOT = (0.0, 0.0, 0.92)
