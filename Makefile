@@ -61,7 +61,7 @@ accelerator: setup
 synthetic-table: setup
 	@for seed in 0 1; do for system in $(TABLE_SYSTEMS); do \
 	  nice -n 19 $(BIN)/poem train synthetic_table:$$system --train.seed $$seed \
-	    --train.out runs/synthetic_table/$$system-$$seed || exit 1; done; done
+	    --train.out runs/synthetic_table_$$system-$$seed || exit 1; done; done
 
 lock: setup
 	$(BIN)/pip-compile --quiet --strip-extras --no-emit-options --no-emit-index-url --no-emit-find-links --extra dev --extra train --output-file requirements.lock pyproject.toml
