@@ -8,7 +8,7 @@ is the first chosen camera, whose own label is the truth, as in training and in 
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -33,8 +33,13 @@ SAME_HAND_M = 0.015
 
 _log = logging.getLogger(__name__)
 
-Change = Callable[[MultiViewBatch, "PRNGKeyArray"], MultiViewBatch]
-"""What is done to a batch before it is given to the system, by a key: cameras shuffled, dropped, ..."""
+
+class Change(Protocol):
+    """What is done to a batch before it is given to the system: one of `evaluation.robustness`."""
+
+    def __call__(self, batch: MultiViewBatch, *, key: PRNGKeyArray) -> MultiViewBatch:
+        """Change the cameras; the hand in the world stays."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,8 @@ def score_set(
                 compares_vertices = is_of_hand(system.hand, read[0].sample)
                 protocol = settings.protocol if compares_vertices else _of_joints(settings.protocol)
             if settings.change is not None:
-                batch = settings.change(batch, jax.random.fold_in(jax.random.key(settings.seed), number))
+                key = jax.random.fold_in(jax.random.key(settings.seed), number)
+                batch = settings.change(batch, key=key)
             answer = system(batch, [one.seen for one in read])
             for place, one in enumerate(read):
                 for view in one.seen.views if settings.each_view else one.seen.views[:1]:

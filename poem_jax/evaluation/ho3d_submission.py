@@ -56,8 +56,8 @@ class Ho3dSubmission:
         """
         if missing := self.missing:
             raise ValueError(
-                f"a submission needs a hand for each of {len(self._joints)} images; {len(missing)} have none, "
-                f"the first is line {missing[0] + 1} of evaluation.txt"
+                f"a submission needs a hand for each of {len(self._joints)} images, and {len(missing)} have "
+                f"none; the first is line {missing[0] + 1} of evaluation.txt"
             )
         with (
             whole_file(path) as file,
