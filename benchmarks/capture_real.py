@@ -190,5 +190,6 @@ def live(_: Path) -> None:
     """Run `poem live` for a minute on the demo's four videos, as if they were filmed now."""
     poem = [sys.executable, "-m", "poem_jax.cli", "live", "--rig", str(DEMO / "calibration.toml"), "--source"]
     options = [str(DEMO), "--loop", "--seconds", "60", "--viewer", "0"]
-    done = subprocess.run([*poem, *options], capture_output=True, text=True, check=True)
-    print(f"live: {(done.stdout + done.stderr).strip().splitlines()[-1]}")
+    both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    done = subprocess.run([*poem, *options], **both, text=True, check=True)
+    print(f"live: {done.stdout.strip().splitlines()[-1]}")

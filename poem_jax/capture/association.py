@@ -11,11 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 from poem_jax.capture import association_words as words
+from poem_jax.capture.calibration_check import check_calibration
+from poem_jax.capture.detections import within_images
 from poem_jax.capture.hand_choice import SIDES, kept_tracks, name_sides, trusted_tracks
 from poem_jax.capture.hand_matching import match_views
 from poem_jax.capture.hand_tracks import Track, follow_hands
+from poem_jax.capture.hands_by_side import hands_by_side
 from poem_jax.capture.lone_detections import join_lone_detections
-from poem_jax.capture.sightings import NONE, Sightings, SightingsOfFrames, vote_for_right
+from poem_jax.capture.sightings import NONE, Sightings, SightingsOfFrames
 from poem_jax.data.capture_folder import hand_names
 from poem_jax.detection import DetectedHand
 from poem_jax.geometry.rig import Rig
@@ -69,15 +72,12 @@ def associate_hands(
     called = [str(i) for i in range(len(detections))] if frame_names is None else frame_names
     seeing = {view for views in detections for view, found in enumerate(views) if found}
     if len(seeing) == 1:
-        return _by_side_alone(detections, rig, seeing.pop(), max_hands, called)
+        return _of_one_camera(detections, rig, seeing.pop(), max_hands, called)
     near = move_origin(rig.T_cam_from_world, distant_origin(rig.T_cam_from_world))
     frames = SightingsOfFrames(detections, rig._replace(T_cam_from_world=near))
     followed = follow_hands(match_views(frame, max_hands) for frame in frames)
     if not followed.tracks:
-        raise ValueError(
-            f"no two of the cameras {', '.join(rig.names)} agree on a hand in any frame, though hands were "
-            "found; check the rig, that frames are synchronous and views in its order"
-        )
+        raise ValueError(_why_none_agree(detections, rig))
     kept = kept_tracks(followed.tracks, max_hands)
     # Hands that are not kept hold their detections too, so that nobody else takes them.
     trusted = trusted_tracks(followed.tracks)
@@ -148,34 +148,31 @@ def _entries(
     return keypoints, scores
 
 
-def _by_side_alone(
+def _of_one_camera(
     detections: Sequence[Sequence[Sequence[DetectedHand]]],
     rig: Rig,
     view: int,
     max_hands: int,
     called: Sequence[str],
 ) -> AssociatedHands:
-    """Return the surest right and the surest left hand of every frame of the only camera that sees any."""
-    keypoints = np.full((len(detections), len(SIDES), rig.num_views, NUM_JOINTS, 2), np.nan)
-    scores = np.full(keypoints.shape[:3], np.nan)
-    left_out: list[int] = []
-    for frame, views in enumerate(detections):
-        for hand in sorted(views[view], key=lambda hand: abs(vote_for_right(hand)) + hand.score):
-            place = frame, SIDES.index(hand.side), view
-            left_out += [frame] * bool(np.isfinite(scores[place]))
-            keypoints[place], scores[place] = hand.keypoints_px, hand.score
-    seen = np.isfinite(scores).sum((0, 2))
-    best = sorted(np.argsort(-seen, kind="stable")[:max_hands])
-    used = [int(i) for i in best if seen[i]]
+    """Return the hands of the only camera that sees any."""
+    hands = hands_by_side(detections, rig.num_views, max_hands)
     warnings = [
         f"only camera {rig.names[view]} sees hands: they are told apart by the detector's side alone, which "
         "no second view confirms; check the sides"
     ]
-    if left_out:
+    if hands.doubled:
         warnings.append(
             f"camera {rig.names[view]} sees several hands of one side in "
-            f"{words.listed(sorted(set(left_out)), called)}; the surest was kept: check these images"
+            f"{words.listed(hands.doubled, called)}; the surest was kept: check these images"
         )
-    return AssociatedHands(
-        keypoints[:, used], scores[:, used], tuple(SIDES[i] for i in used), tuple(warnings)
-    )
+    return AssociatedHands(hands.keypoints_px, hands.score, hands.hand_side, tuple(warnings))
+
+
+def _why_none_agree(detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig) -> str:
+    """Say that nothing meets, and what is wrong with the rig if its hands by side tell."""
+    seen = within_images(hands_by_side(detections, rig.num_views).keypoints_px, rig)
+    found = sorted(check_calibration(rig, seen), key=lambda finding: not finding.fatal)
+    why = str(found[0]) if found else "check the rig, that frames are synchronous and views in its order"
+    cameras = ", ".join(rig.names)
+    return f"no two of the cameras {cameras} agree on a hand in any frame, though hands were found: {why}"

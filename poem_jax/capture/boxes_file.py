@@ -23,7 +23,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from poem_jax.capture.boxes_labels import cameras_of_views, detector_of, frames_of, sides_of, times_of
+from poem_jax.capture.boxes_labels import (
+    cameras_of_views,
+    detector_of,
+    frames_of,
+    offsets_of,
+    sides_of,
+    times_of,
+)
 from poem_jax.data.capture_folder import frame_key
 from poem_jax.geometry.rig import HALF_PIXEL
 from poem_jax.hand.topology import NUM_JOINTS
@@ -69,6 +76,9 @@ class HandBoxes(NamedTuple):
     """What found the key points, None where the file does not say."""
     time_s: Float[Array, " frame"] | None = None
     """Seconds since the take began, None where the file gives none; NaN in frames that it does not name."""
+    offsets_s: Float[Array, " view"] | None = None
+    """Of the cameras, under which the frames were put together; None where the file gives none; NaN of those
+    that it does not name."""
 
 
 def read_boxes(path: str | os.PathLike) -> HandBoxes:
@@ -106,7 +116,8 @@ def read_boxes(path: str | os.PathLike) -> HandBoxes:
     cameras = cameras_of_views(content, boxes.shape[2], path)
     times = times_of(content, len(boxes), path)
     detector = detector_of(content, path)
-    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, detector, times)
+    offsets = offsets_of(content, boxes.shape[2], path)
+    return HandBoxes(boxes, sides, frames, keypoints, confidence, cameras, detector, times, offsets)
 
 
 def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
@@ -124,6 +135,8 @@ def write_boxes(path: str | os.PathLike, boxes: HandBoxes) -> Path:
         content["detector"] = np.array(boxes.detector)
     if boxes.time_s is not None:
         content["time_s"] = boxes.time_s
+    if boxes.offsets_s is not None:
+        content["offsets_s"] = boxes.offsets_s
     # A stream, since NumPy would add a suffix to a name that has none.
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **content)
@@ -218,9 +231,11 @@ def _take_everywhere(boxes: HandBoxes, rows: Array, axis: int) -> HandBoxes:
         for array in (boxes.boxes_px, boxes.keypoints_px, boxes.confidence)
     )
     boxes = boxes._replace(boxes_px=boxes_px, keypoints_px=keypoints_px, confidence=confidence)
-    if axis != 0 or boxes.time_s is None:
-        return boxes
-    return boxes._replace(time_s=_take(boxes.time_s, rows, axis))
+    if axis == 0 and boxes.time_s is not None:
+        return boxes._replace(time_s=_take(boxes.time_s, rows, 0))
+    if axis == 2 and boxes.offsets_s is not None:
+        return boxes._replace(offsets_s=_take(boxes.offsets_s, rows, 0))
+    return boxes
 
 
 def _take(array: Array, rows: Array, axis: int) -> Array:

@@ -55,6 +55,19 @@ def times_of(content: Mapping[str, Array], num_frames: int, path: Path) -> Float
     return times
 
 
+def offsets_of(content: Mapping[str, Array], num_views: int, path: Path) -> Float[Array, " view"] | None:
+    """Return the cameras' offsets, seconds; None where there are none, ValueError where they are wrong."""
+    if "offsets_s" not in content:
+        return None
+    offsets = content["offsets_s"]
+    numbers = np.issubdtype(offsets.dtype, np.number)
+    if offsets.shape != (num_views,) or not numbers or not np.isfinite(offsets).all():
+        raise ValueError(
+            f"{path}: `offsets_s` must be the seconds of {num_views} views; got {offsets.tolist()}"
+        )
+    return offsets.astype(np.float64)
+
+
 def cameras_of_views(content: Mapping[str, Array], num_views: int, path: Path) -> tuple[str, ...] | None:
     """Return the names of the views, None where there are none; ValueError where they are wrong."""
     if "cameras" not in content:

@@ -15,7 +15,8 @@ from tqdm import tqdm
 
 from poem_jax.capture.association import AssociatedHands, associate_hands
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints
-from poem_jax.capture.detections import Detections, SearchFile
+from poem_jax.capture.detections import Detections, SearchFile, within_images
+from poem_jax.capture.hands_by_side import HandsBySide, hands_by_side
 from poem_jax.capture.moments import Moments
 from poem_jax.capture.read import ReadView, read_views
 from poem_jax.capture.timing import Timing
@@ -41,6 +42,7 @@ def detect_hands(
     *,
     max_hands: int = 2,
     video: bool = False,
+    by_side: bool = False,
     detector: Detector | None = None,
     file: SearchFile | None = None,
     when_stopped: Callable[[HandBoxes], object] | None = None,
@@ -54,6 +56,8 @@ def detect_hands(
         max_hands: Hands in the take.
         video: A hand is looked for where it was in the frame before: faster where frames follow each other
             closely.
+        by_side: Tell hands apart by the sides that the detector names, and not by where their rays meet: to
+            judge the rig.
         detector: Finds the hands in some views of a frame; None = `poem_jax.detection`.
         file: Keeps what was found; frames that it has of the same search are not searched again.
         when_stopped: Called with the hands of the frames that are done, where there are any, when a signal
@@ -67,6 +71,10 @@ def detect_hands(
         ValueError: No image can be read, no hand was found, or no two cameras agree on one.
     """
     name = MEDIAPIPE_HANDS if detector is None else None
+
+    def put_together(found: Detections) -> HandBoxes:
+        return _hand_boxes(found, frames, rig, max_hands, by_side, name)
+
     found = Detections(rig.num_views) if file is None else file.take_up(rig.num_views)
     search = _Search(rig, _our_detector(rig.num_views, max_hands, video) if detector is None else detector)
     done = min(len(found), len(frames))
@@ -83,14 +91,14 @@ def detect_hands(
                 bar.update()
         except KeyboardInterrupt:
             if when_stopped is not None:
-                _hand_over(found, frames, rig, max_hands, name, when_stopped)
+                _hand_over(found, put_together, when_stopped)
             raise
         finally:
             if file is not None:
                 file.close()
     found = found[: len(frames)]
     search.report(found)
-    return _hand_boxes(found, frames, rig, max_hands, name)
+    return put_together(found)
 
 
 def describe_search(moments: Moments, rig: Rig, timing: Timing, *, max_hands: int, video: bool) -> str:
@@ -174,15 +182,12 @@ def _our_detector(num_views: int, max_hands: int, video: bool) -> Detector:
 
 def _hand_over(
     found: Detections,
-    frames: Sequence[FramePaths],
-    rig: Rig,
-    max_hands: int,
-    detector: str | None,
+    put_together: Callable[[Detections], HandBoxes],
     when_stopped: Callable[[HandBoxes], object],
 ) -> None:
     """Pass on what was found so far, if it is enough to tell hands apart."""
     try:
-        hands = _hand_boxes(found, frames, rig, max_hands, detector)
+        hands = put_together(found)
     except ValueError as error:
         _log.warning("no key points are written of the frames that were searched: %s", error)
         return
@@ -190,14 +195,22 @@ def _hand_over(
 
 
 def _hand_boxes(
-    found: Detections, frames: Sequence[FramePaths], rig: Rig, max_hands: int, detector: str | None
+    found: Detections,
+    frames: Sequence[FramePaths],
+    rig: Rig,
+    max_hands: int,
+    by_side: bool,
+    detector: str | None,
 ) -> HandBoxes:
     """Put what `detector` found into one track a hand."""
     searched = [frames[index] for index in range(len(found))]
     names, times = tuple(frame.name for frame in searched), [frame.time_s for frame in searched]
-    hands = associate_hands(found, rig, max_hands=max_hands, frame_names=names)
-    for warning in hands.warnings:
-        _log.warning("%s", warning)
+    if by_side:
+        hands = hands_by_side(found, rig.num_views, max_hands)
+    else:
+        hands = associate_hands(found, rig, max_hands=max_hands, frame_names=names)
+        for warning in hands.warnings:
+            _log.warning("%s", warning)
     keypoints = within_images(hands.keypoints_px, rig)
     boxes = boxes_from_keypoints(keypoints)
     time_s = None if None in times else np.array(times, float)
@@ -206,13 +219,5 @@ def _hand_boxes(
     )
 
 
-def within_images(
-    keypoints_px: Float[Array, "frame hand view 21 2"], rig: Rig
-) -> Float[Array, "frame hand view 21 2"]:
-    """Return raw pixels with key points that are guessed beyond the image's border unseen (NaN)."""
-    inside = (keypoints_px >= 0) & (keypoints_px <= rig.size_wh[:, None])
-    return np.where(inside.all(-1, keepdims=True), keypoints_px, np.nan)
-
-
-def _confidence(hands: AssociatedHands) -> Float[Array, "frame hand view 21"]:
+def _confidence(hands: AssociatedHands | HandsBySide) -> Float[Array, "frame hand view 21"]:
     return np.repeat(hands.score[..., None], hands.keypoints_px.shape[-2], axis=-1)

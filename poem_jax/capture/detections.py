@@ -14,8 +14,9 @@ from typing import IO, overload
 import numpy as np
 
 from poem_jax.detection import DetectedHand
+from poem_jax.geometry.rig import Rig
 from poem_jax.hand.topology import NUM_JOINTS
-from poem_jax.typing import Array, Bool
+from poem_jax.typing import Array, Bool, Float
 
 LOST = 255
 """In place of the number of hands in an image."""
@@ -114,6 +115,14 @@ class Detections(Sequence[Found]):
             if len(data) < size:
                 return end
             self._add(counts, np.frombuffer(data, _HAND))
+
+
+def within_images(
+    keypoints_px: Float[Array, "frame hand view 21 2"], rig: Rig
+) -> Float[Array, "frame hand view 21 2"]:
+    """Return raw pixels with key points that are guessed beyond the image's border unseen (NaN)."""
+    inside = (keypoints_px >= 0) & (keypoints_px <= rig.size_wh[:, None])
+    return np.where(inside.all(-1, keepdims=True), keypoints_px, np.nan)
 
 
 class SearchFile:

@@ -17,7 +17,7 @@ from poem_jax.calibration.lens_reach import beyond_the_lens
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.fit_trust import joint_confidence
-from poem_jax.capture.frame import Frame, HandResult
+from poem_jax.capture.frame import Frame, HandResult, too_few_views
 from poem_jax.capture.frame_padding import FRAMES_TOGETHER, padded_frames, padded_times
 from poem_jax.capture.frame_times import SECONDS_PER_FRAME, known_times, times_of
 from poem_jax.capture.keypoint_agreement import check_triangulation, judge_fit, shows_palms
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from poem_jax.fitting.detector_offsets import KeypointOffsets
     from poem_jax.fitting.kinematics import KeypointModel
 
+MIN_VIEWS = 2
+"""Fewer do not say where a hand is."""
 NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by two views that agree on them"
 
 _CONTEXT = 16
@@ -123,9 +125,11 @@ def _with_results(
     group: list[Frame], turns: range, fitted: list["FitResult"], trusted: list[Array]
 ) -> Iterator[Frame]:
     """Give the frames whose turn it is what came of their hands."""
+    seen = np.isfinite(_observed(group)[0]).all(-1).any(-1).sum(-1)
     for turn in turns:
         pairs = zip(fitted, trusted, strict=True)
-        yield group[turn]._replace(hands=tuple(fitted_hand(fit, turn, trust) for fit, trust in pairs))
+        found = [fitted_hand(fit, turn, trust) for fit, trust in pairs]
+        yield group[turn]._replace(hands=tuple(map(_with_reason, found, seen[turn].tolist())))
 
 
 def _keypoint_models(
@@ -238,6 +242,12 @@ def fit_group(
     observations = Observations(*padded, rig.K, rig.T_cam_from_world)
     fitted = jax.device_get(fit_take(model, observations, shape, config, padded_times(time_s, together)))
     return jax.tree.map(lambda array: array[: len(keypoints)], fitted)
+
+
+def _with_reason(found: HandResult, views: int) -> HandResult:
+    """Say of a hand that no two views see that this is why it was not fitted."""
+    few = found.reason is not None and views < MIN_VIEWS
+    return found._replace(reason=too_few_views(views, MIN_VIEWS)) if few else found
 
 
 def fitted_hand(fitted: "FitResult", turn: int, trusted: Array) -> HandResult:

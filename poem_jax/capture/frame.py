@@ -61,6 +61,11 @@ class HandResult(NamedTuple):
     """Whether the hand was not seen at this moment, and stands between those before and after it."""
 
 
+def too_few_views(seen: int, needed: int) -> str:
+    """Return the reason of a hand that not enough views see: one, or two, are needed."""
+    return f"seen in {seen} view(s); {'two are' if needed == 2 else 'one is'} needed"
+
+
 class Frame(NamedTuple):
     """One moment. Hands are in the order of the take's sides, views in the order of the rig."""
 

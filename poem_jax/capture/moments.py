@@ -34,6 +34,8 @@ class Moments(NamedTuple):
     """The file of offsets and rates, where there is one."""
     whole: Sequence[FramePaths] | None = None
     """All moments of the take, where these are a part of it."""
+    offsets_s: Mapping[str, float] | None = None
+    """Of every camera; None = the capture says itself which images are of one moment."""
 
     @property
     def follow_closely(self) -> bool:
@@ -76,6 +78,7 @@ def _whole(folder: Path, rig: Rig, timing: Timing) -> Moments:
     """List all moments of a capture."""
     sync = read_sync(folder, rig.names)
     offsets_s = {**sync.offsets_s, **of_cameras(timing.offsets_s, rig.names, "--offsets")}
+    every = {camera: offsets_s.get(camera, 0.0) for camera in rig.names}
     videos = _video_files(folder)
     if videos and (folder / "frames").is_dir():
         raise ValueError(
@@ -85,13 +88,13 @@ def _whole(folder: Path, rig: Rig, timing: Timing) -> Moments:
         found = match_cameras(videos, rig.names, "videos")
         _tell_missing(found, rig, "videos", folder)
         frames = VideoMoments(open_clips(found, rig.names, offsets_s, sync.frames_per_second), rig.num_views)
-        return Moments(frames, frames.frames_per_second, True)
+        return Moments(frames, frames.frames_per_second, True, offsets_s=every)
     rate = _one_rate(sync.frames_per_second, folder)
     if not (folder / "frames").is_dir() and not any(images_of_cameras(folder, rig.names)):
         found = find_camera_folders(folder, rig.names)
         if found:
             _tell_missing(found, rig, "folders of images", folder)
-            return Moments(folder_moments(found, rig.names, offsets_s, rate), rate, False)
+            return Moments(folder_moments(found, rig.names, offsets_s, rate), rate, False, offsets_s=every)
     if any(offsets_s.values()):
         raise ValueError(
             f"{folder} says itself which images are of one moment (frames/<frame>/<camera>.jpg): offsets are "

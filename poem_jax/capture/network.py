@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from poem_jax.batch import Prediction
-from poem_jax.capture.frame import Frame, HandCrops, HandResult
+from poem_jax.capture.frame import Frame, HandCrops, HandResult, too_few_views
 from poem_jax.capture.network_trust import (
     GENERAL,
     SHIPPED,
@@ -191,8 +191,7 @@ def _result(
         return known
     views, needed = int(crops.view_mask.sum()), views_needed(network.config)
     if views < needed:
-        wanted = "two are" if needed == 2 else "one is"
-        return HandResult(crops.view_mask, f"seen in {views} view(s); {wanted} needed")
+        return HandResult(crops.view_mask, too_few_views(views, needed))
     if predicted is None or not predicted.valid:
         return HandResult(crops.view_mask, UNDETERMINED)
     assert fed is not None

@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,9 @@ from poem_jax.capture.picked_frames import PickedFrames
 from poem_jax.capture.timing import Timing
 from poem_jax.data.capture_folder import FramePaths, find_rig, frame_key, hand_names
 from poem_jax.geometry.rig import Rig
-from poem_jax.io.file_names import safe_file_names
+from poem_jax.io.file_names import name_key, safe_file_names
+
+_SAME_OFFSET_S = 1e-6
 
 BOXES_FILES = ("boxes.npz", "keypoints.npz")
 
@@ -97,13 +99,14 @@ def read_take(
     if not folder.is_dir():
         raise FileNotFoundError(f"no capture folder at {folder}")
     found = find_rig(folder, rig)
-    moments = find_moments(folder, found, Timing() if timing is None else timing)
     boxes_file = boxes_beside(folder) if boxes is None else Path(boxes)
     if boxes_file is None:
         looked = " or ".join(str(folder / name) for name in BOXES_FILES)
         raise FileNotFoundError(f"no {looked}: {HOW_TO_GET_BOXES}")
+    hands = read_boxes(boxes_file)
+    moments = _moments_of(hands, folder, found, Timing() if timing is None else timing, boxes_file)
     names = [frame.name for frame in moments.frames]
-    hands = align_boxes(read_boxes(boxes_file), names, found.names, boxes_file)
+    hands = align_boxes(hands, names, found.names, boxes_file)
     return make_take(found, moments.frames, hands, moments.frames_per_second)
 
 
@@ -141,7 +144,7 @@ def read_keypoint_take(
         moments = Moments([], None, False)
     else:
         offsets = Timing() if timing is None else Timing(timing.offsets_s)
-        moments = find_moments(images, found, offsets)
+        moments = _moments_of(hands, images, found, offsets, keypoints)
     pictures = [frame.name for frame in moments.frames]
     _check_numbers_differ(pictures)
     if hands.frames is None and len(pictures) not in (0, len(hands.boxes_px)):
@@ -163,6 +166,40 @@ def read_keypoint_take(
         )
     paths = PickedFrames(moments.frames, rows, names, found.num_views)
     return make_take(found, paths, hands, _rate_of_rows(rows, moments))
+
+
+def found_at(hands: HandBoxes, moments: Moments) -> HandBoxes:
+    """Note the offsets under which the images were put together that hands were found in."""
+    if moments.offsets_s is None:
+        return hands
+    return hands._replace(offsets_s=np.array(list(moments.offsets_s.values())))
+
+
+def _moments_of(
+    hands: HandBoxes, folder: str | os.PathLike, rig: Rig, timing: Timing, path: str | os.PathLike
+) -> Moments:
+    """List the moments of a capture under the offsets under which its hands were found.
+
+    Raises: ValueError: The offsets that are asked for are others; or as `find_moments`.
+    """
+    asked = find_moments(folder, rig, timing)
+    if hands.offsets_s is None or asked.offsets_s is None:
+        return asked
+    by_key = dict(zip(map(name_key, hands.cameras or rig.names), hands.offsets_s.tolist(), strict=False))
+    noted = {camera: by_key[name_key(camera)] for camera in rig.names if name_key(camera) in by_key}
+    other = [camera for camera in noted if abs(noted[camera] - asked.offsets_s[camera]) > _SAME_OFFSET_S]
+    if not other:
+        return asked
+    told = f"{other[0]}={noted[other[0]]:g}, not {asked.offsets_s[other[0]]:g}"
+    if timing.offsets_s:
+        raise ValueError(
+            f"{path}: its hands were found under other offsets ({told} s): move it away to search again, or "
+            "leave --offsets out"
+        )
+    _log.warning(
+        "%s: the images are taken under the offsets under which its hands were found: %s", path, told
+    )
+    return find_moments(folder, rig, replace(timing, offsets_s=noted))
 
 
 def make_take(

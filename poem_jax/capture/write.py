@@ -17,6 +17,7 @@ import numpy as np
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.outputs.exports import ANIMATION, export_files, write_exports
 from poem_jax.capture.outputs.formats import DEFAULT_FORMATS, Format
+from poem_jax.capture.outputs.labelled_capture import LabelledCapture
 from poem_jax.capture.outputs.meshes import remove_own_meshes, write_frame_meshes
 from poem_jax.capture.outputs.overlays import Drawn, OverlayVideos, draw_views, write_png
 from poem_jax.capture.outputs.page import PageFrames, is_long, make_gallery
@@ -34,6 +35,8 @@ from poem_jax.viz.page import Caption, write_page
 PREDICTION, REPORT, PAGE = "prediction.npz", "report.json", "index.html"
 OVERLAYS = "overlays"
 """Folder of the overlay videos, apart from a capture's own, should both be in one place."""
+CAPTURE = "capture"
+"""Folder of the take as a labelled capture."""
 
 _log = logging.getLogger(__name__)
 
@@ -150,6 +153,8 @@ class _Writer:
         chosen = style.formats & {Format.VIDEO, Format.PNG}
         self._overlays = chosen or {Format.VIDEO if is_long(take.num_frames) else Format.PNG}
         self._videos = OverlayVideos([out / OVERLAYS / f"{name}.mp4" for name in take.rig.names])
+        labelled = LabelledCapture(out / CAPTURE, take.rig, style.origin_world)
+        self._capture = labelled if Format.CAPTURE in style.formats else None
         self._gallery = make_gallery(take.rig, take.num_frames)
         self._pages = PageFrames()
 
@@ -166,6 +171,8 @@ class _Writer:
         }
         self._write_meshes(folder, vertices)
         self._write_overlays(folder, frame, vertices)
+        if self._capture is not None:
+            self._capture.add(frame)
         self._prediction.add(frame)
         if self.report.solved and self._prediction.is_due():
             self._prediction.write()
@@ -174,10 +181,13 @@ class _Writer:
 
     def finish(self, clock: Clock, about: Mapping[str, Any]) -> None:
         """Write what belongs to all frames; if a part of it cannot be, the rest is there."""
-        self.files.append(self._prediction.write())
+        prediction = self._prediction.write()
+        self.files.append(prediction)
         exported: Mapping[str, Any] = {}
         try:
             self.files += self._videos.finish()
+            if self._capture is not None:
+                self.files += self._capture.finish(prediction)
         finally:
             try:
                 exported = self._write_exports()
@@ -249,7 +259,8 @@ def frame_folder(out: Path, name: str) -> Path:
         ValueError: The name cannot be that of a folder, belongs to a file of the take, or is a link that
             leads elsewhere.
     """
-    if safe_file_name(name, "a frame's name") in {OVERLAYS, *(path.name for path in take_files(out))}:
+    taken = {OVERLAYS, CAPTURE, *(path.name for path in take_files(out))}
+    if safe_file_name(name, "a frame's name") in taken:
         raise ValueError(f"a frame cannot be called {name!r}: one of the results has this name")
     folder = out / name
     if folder.is_symlink():

@@ -73,8 +73,9 @@ class Check:
 
         check_folder_is_writable(self.out)
         self.out.mkdir(parents=True, exist_ok=True)
-        find_keypoints(footage, self.out / FOUND_FILE, self.rig, self.max_hands, self.video, self.moments)
-        return self.out / FOUND_FILE
+        found = self.out / FOUND_FILE
+        find_keypoints(footage, found, self.rig, self.max_hands, self.video, self.moments, by_side=True)
+        return found
 
 
 @dataclass(frozen=True)

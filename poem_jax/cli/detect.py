@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from poem_jax.cli.messages import say, tells_what_is_left
@@ -52,11 +51,6 @@ def where_hands_are(
     if max_hands < 1:
         raise ValueError(f"--max-hands must be 1 or more; got {max_hands}")
     if (given := boxes_beside(folder)) is not None:
-        if moments.offsets is not None:
-            raise ValueError(
-                f"--offsets is for a search, and hands are where {given} says, found under the offsets of "
-                "then; move that file away to search again, or leave --offsets out"
-            )
         say(f"hands are where {given} says")
         return given
     found = out / FOUND_FILE
@@ -71,8 +65,9 @@ def find_keypoints(
     max_hands: int,
     video: bool,
     moments: Moments,
+    by_side: bool = False,
 ) -> None:
-    """Write the key points of a capture to the file `out`, and print what was found.
+    """Write the key points of a capture to the file `out`, and print what was found; options as in `Detect`.
 
     What was found in each image of a take stays beside it, so that nothing is searched twice: not after an
     interruption, and not for a better calibration.
@@ -83,6 +78,7 @@ def find_keypoints(
     from poem_jax.capture.detect import describe_search, detect_hands
     from poem_jax.capture.detections import SearchFile
     from poem_jax.capture.moments import find_moments
+    from poem_jax.capture.take import found_at
     from poem_jax.data.capture_folder import RIG_FILES, find_rig, hand_names
     from poem_jax.io.writable import check_inputs_stay
 
@@ -109,10 +105,11 @@ def find_keypoints(
             rig,
             max_hands=max_hands,
             video=video,
+            by_side=by_side,
             file=file,
-            when_stopped=partial(write_boxes, part),
+            when_stopped=lambda hands: write_boxes(part, found_at(hands, take)),
         )
-        write_boxes(out, hands)
+        write_boxes(out, found_at(hands, take))
     part.unlink(missing_ok=True)
     views = np.isfinite(hands.boxes_px).all(-1).sum(2)
     for name, count in zip(hand_names(hands.hand_side), views.T, strict=True):

@@ -7,7 +7,7 @@ import enum
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from poem_jax.data.capture_folder import RIG_FILES
+from poem_jax.data.capture_folder import RIG_FILES, find_rig_file
 from poem_jax.data.shards import is_hidden
 from poem_jax.mixture.config import (
     ArcticSource,
@@ -70,6 +70,8 @@ def recognise(path: str | Path) -> Kind:
             "such as 'DexYCB_mv_test-{000000..000003}.tar'), the folder of a raw data set, or a capture"
         )
     found = [kind for kind in Kind if _is(kind, folder)]
+    if not found and _holds_calibration(folder):
+        return Kind.CAPTURE
     if len(found) == 1:
         return found[0]
     which = f"could be {' or '.join(found)}" if found else "is none that is known"
@@ -128,6 +130,17 @@ def _is(kind: Kind, folder: Path) -> bool:
         return any((folder / name).is_file() for name in RIG_FILES)
     places = (folder, *(folder / name for name in _NAMES[kind]))
     return any(_MARKS[kind](place) for place in places if place.is_dir())
+
+
+def _holds_calibration(folder: Path) -> bool:
+    """Tell whether another tool's calibration lies there; raw sets hold some too."""
+    try:
+        find_rig_file(folder)
+    except FileNotFoundError:
+        return False
+    except ValueError:  # Several: opening the capture says so.
+        return True
+    return True
 
 
 def _holds(*names: str) -> Callable[[Path], bool]:

@@ -198,6 +198,20 @@ def test_sides_are_named_by_all_votes(votes, sides, warning):
     assert warning is None or warning in told[0][0]
 
 
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda T: np.diag([1.0, -1, -1, 1]) @ T, "OpenGL or Blender axes"),
+        (lambda T: rigid(T[:, :3, :3], 1000 * T[:, :3, 3]), "millimetres"),
+    ],
+)
+def test_where_no_two_views_agree_the_mistake_in_the_rig_is_named(change, cause):
+    scene = planted.planted(planted.clean, "four", 0)
+    wrong = scene.rig._replace(T_cam_from_world=change(scene.rig.T_cam_from_world))
+    with pytest.raises(ValueError, match=f"no two of the cameras .* agree on a hand.*{cause}"):
+        associate_hands(scene.found, wrong)
+
+
 def test_errors_say_what_is_missing():
     scene = planted.planted(planted.clean, "two", 0)
     with pytest.raises(ValueError, match="`max_hands` must be 1 or more; got 0"):

@@ -10,9 +10,12 @@ from poem_jax.calibration.rig_json import write_rig
 from poem_jax.capture import detect
 from poem_jax.capture.boxes_file import read_boxes
 from poem_jax.capture.detections import Detections, SearchFile
+from poem_jax.capture.take import read_keypoint_take, read_take
+from poem_jax.capture.timing import Timing
 from poem_jax.cli import main
 from poem_jax.data.lens import project_raw
 from poem_jax.detection import DetectedHand
+from poem_jax.geometry.transforms import invert_rigid
 from poem_jax.hand.model import hand_mesh
 from poem_jax.hand.template import default_hand
 from tests.videos import cut, damage, number_of, picture, write_video
@@ -84,6 +87,39 @@ def test_offsets_and_part_of_a_take(search, tmp_path):
     assert search("--offsets", "front=0.3", "--start", "0.5", "--end", "9f", "--every", "2")[0] == 0
     np.testing.assert_array_equal(numbers(tmp_path / "found.npz"), [[8, 5, 8], [10, 7, 10]])
     np.testing.assert_allclose(read_boxes(tmp_path / "found.npz").time_s, [0.5, 0.7])
+
+
+def test_images_beside_key_points_are_those_in_which_they_were_found(search, folder, tmp_path, caplog):
+    found = tmp_path / "found.npz"
+    search("--offsets", "front=0.3")
+    np.testing.assert_allclose(read_boxes(found).offsets_s, [0, 0.3, 0])
+    frames = list(read_keypoint_take(found, images=folder).frames)
+    assert "images are taken under the offsets" in caplog.text
+    shown = [[number_of(image.read()) for image in frame.image_files] for frame in frames]
+    np.testing.assert_array_equal(shown, numbers(found))
+    caplog.clear()
+    same = read_take(folder, boxes=found, timing=Timing({"front": 0.3}))
+    assert [frame.name for frame in same.frames] == [frame.name for frame in frames]
+    assert "images are taken" not in caplog.text
+    with pytest.raises(ValueError, match=r"found under other offsets \(front=0.3, not 0.1 s\)"):
+        read_take(folder, boxes=found, timing=Timing({"front": 0.1}))
+
+
+def test_a_rig_is_checked_by_hands_that_it_did_not_put_together(search, folder, rig, tmp_path, capsys):
+    """With the wrong rig no two views meet, and a camera that was moved would be left out."""
+    search()
+    check = ["calibration", "check", str(folder / "rig.json"), "--videos", str(folder)]
+    assert main([*check, "--out", str(tmp_path / "good")]) == 0
+    T = rig.T_cam_from_world.copy()
+    T[1, 0, 3] += 0.1
+    for wrong, told in (
+        (invert_rigid(rig.T_cam_from_world), "inverted extrinsics"),
+        (T, "camera moved"),
+    ):
+        write_rig(folder / "rig.json", rig._replace(T_cam_from_world=wrong))
+        capsys.readouterr()
+        assert main([*check, "--out", str(tmp_path / told)]) == 1
+        assert told in capsys.readouterr().out
 
 
 def test_a_search_that_is_stopped_goes_on(search, tmp_path, capsys, caplog):

@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from poem_jax.calibration.write_calibration import write_calibration
 from poem_jax.cli import main
 from poem_jax.mixture.config import CapturesSource
 from poem_jax.mixture.recognise import Kind, recognise, source_at
 from tests.data.sources.test_captures import write_capture
+from tests.rigs import small_rig
 
 
 @pytest.fixture
@@ -75,6 +77,13 @@ def test_a_capture_is_opened_with_the_users_mano(tmp_path):
 def test_patterns_and_files_of_tars_are_tars():
     assert recognise("x/DexYCB_mv_test-{000000..000003}.tar") is Kind.TARS
     assert recognise("x/*.tar") is Kind.TARS
+
+
+@pytest.mark.parametrize("name", ["rig.toml", "calibration/rig.toml"])
+def test_a_capture_may_have_the_calibration_of_another_tool(name, tmp_path):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    write_calibration(tmp_path / name, small_rig())
+    assert recognise(tmp_path) is Kind.CAPTURE
 
 
 def test_what_is_not_recognised_says_what_could_be(tmp_path):

@@ -13,9 +13,9 @@ from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.boxes_file import boxes_from_keypoints
 from poem_jax.capture.crop import crop_hands, hand_squares
-from poem_jax.capture.fit import NOT_FITTED, fit_config, fit_group, fitted_hand
+from poem_jax.capture.fit import MIN_VIEWS, fit_config, fit_group, fitted_hand
 from poem_jax.capture.fit_trust import joint_confidence
-from poem_jax.capture.frame import Frame, HandResult
+from poem_jax.capture.frame import Frame, HandResult, too_few_views
 from poem_jax.capture.live.following import SIDES
 from poem_jax.capture.network import Network, check_rig, predict_hands
 from poem_jax.capture.take import Take
@@ -103,8 +103,9 @@ class _LiveHandFit:
         self, time_s: float, keypoints: Float[Array, "view 21 2"], confidence: Float[Array, "view 21"]
     ) -> HandResult:
         """Fit a moment."""
-        if np.isfinite(keypoints).all(-1).any(-1).sum() < 2:
-            return HandResult(np.zeros(self._rig.num_views, bool), NOT_FITTED)
+        views = int(np.isfinite(keypoints).all(-1).any(-1).sum())
+        if views < MIN_VIEWS:
+            return HandResult(np.zeros(self._rig.num_views, bool), too_few_views(views, MIN_VIEWS))
         moment = keypoints[None], confidence[None]
         adds = len(self._kept) < MOMENTS_FOR_SHAPE and time_s - self._kept_s >= _APART_S
         anew = self._shape is None or (adds and len(self._kept) + 1 in _SETTLED_AT)

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from poem_jax.capture.boxes_file import boxes_from_keypoints
-from poem_jax.capture.detect import Detector, within_images
+from poem_jax.capture.detect import Detector
+from poem_jax.capture.detections import within_images
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.live.following import HandFollower
 from poem_jax.capture.live.moments import Moment

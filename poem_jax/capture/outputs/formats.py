@@ -20,6 +20,8 @@ class Format(enum.StrEnum):
     """Overlays as one video a camera, however short the take."""
     PNG = "png"
     """Overlays as one image a frame and camera, however long the take."""
+    CAPTURE = "capture"
+    """`capture/`, the take as a labelled capture to train a model on."""
 
 
 DEFAULT_FORMATS = frozenset({Format.GLB})

@@ -7,7 +7,7 @@ import pytest
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.capture.boxes_file import boxes_from_keypoints
-from poem_jax.capture.fit import NOT_FITTED, fit_config
+from poem_jax.capture.fit import fit_config
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.live.engines import MOMENTS_FOR_SHAPE, live_fit
 from poem_jax.fitting import Observations, fit_take, keypoint_model
@@ -52,5 +52,5 @@ def test_once_the_shape_is_known_each_moment_is_the_fit_of_itself():
             )
             alone = fit_take(keypoint_model(hands.of(side)), seen, frame.hands[index].shape, config)
             np.testing.assert_allclose(frame.hands[index].joints_world, alone.joints[0], atol=1e-6)
-    assert done[-1].hands[0].reason == NOT_FITTED
+    assert done[-1].hands[0].reason == "seen in 0 view(s); two are needed"
     assert done[-1].hands[1].reason is None
