@@ -204,17 +204,18 @@ def _batches(
             return str(error)
 
     indices = np.linspace(0, len(source) - 1, count).round().astype(int).tolist()
+    size = 1 if system.one_at_a_time else settings.batch_size
     group: list[_Read] = []
-    for _, one in read_ahead(indices, read, depth=2 * settings.batch_size):
+    for _, one in read_ahead(indices, read, depth=2 * size):
         if isinstance(one, str):
             left_out.append(one)
             continue
         group.append(one)
-        if len(group) == settings.batch_size:
-            yield _batch(group, settings, most), group
+        if len(group) == size:
+            yield _batch(group, size, most), group
             group = []
     if group:
-        yield _batch(group, settings, most), group
+        yield _batch(group, size, most), group
 
 
 def _read(system: System, source: FrameSource, settings: SetSettings, index: int, most: int) -> _Read | str:
@@ -231,8 +232,8 @@ def _read(system: System, source: FrameSource, settings: SetSettings, index: int
     return _Read(index, sample._replace(pose=None, shape=None, root_world=root), Seen(frame, views))
 
 
-def _batch(group: Sequence[_Read], settings: SetSettings, most: int) -> MultiViewBatch:
-    return pad_batch(collate([one.sample for one in group], most), settings.batch_size)
+def _batch(group: Sequence[_Read], size: int, most: int) -> MultiViewBatch:
+    return pad_batch(collate([one.sample for one in group], most), size)
 
 
 def _in_view(answer: Answer, place: int, one: _Read, view: int) -> ViewAnswer:

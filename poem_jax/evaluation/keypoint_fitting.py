@@ -39,7 +39,7 @@ class KeypointFitting:
                 views, OpenPose order, NaN = unseen. A frame that is missing has none.
         """
         self.hand, self.image_hw, self.recipe = hand, (CROP_SIDE_PX, CROP_SIDE_PX), NONE
-        self.least_views, self.takes_root = 2, False
+        self.least_views, self.takes_root, self.one_at_a_time = 2, False, False
         self.most_views: int | None = None
         self._keypoints = keypoints
         self._model = keypoint_model(hand, offsets_of(MEDIAPIPE_HANDS) if keypoints is None else None)

@@ -1,7 +1,6 @@
 """What is scored on a data set: anything that turns a batch of calibrated views into hands."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import jax
@@ -50,6 +49,8 @@ class System(Protocol):
     """None = any number."""
     takes_root: bool
     """Whether it reads `MultiViewBatch.root_world`, of which a row of NaN is unknown."""
+    one_at_a_time: bool
+    """Whether a sample's hand would depend on the others of its batch."""
 
     def __call__(self, batch: MultiViewBatch, seen: Sequence[Seen]) -> Answer:
         """Find one hand per sample.
@@ -61,8 +62,11 @@ class System(Protocol):
         ...
 
 
+_apply = jax.jit(apply, static_argnames="config")
+
+
 class Network:
-    """A model and its weights; every shape of batch compiles once."""
+    """A model and its weights; every shape of batch compiles once for all models of a config."""
 
     def __init__(self, config: ModelConfig, params: Params) -> None:
         """Take the model.
@@ -79,14 +83,14 @@ class Network:
         self.least_views = 2 if config.triangulates else 1
         self._padded_to, self.most_views = config.view_range
         self.takes_root = config.takes_root
-        self._params = params
-        self._find = jax.jit(partial(apply, config=config))
+        self.one_at_a_time = config.couples_samples
+        self._config, self._params = config, params
 
     def __call__(self, batch: MultiViewBatch, seen: Sequence[Seen]) -> Answer:
         """Find one hand per sample; see `System`."""
         padded = pad_views(batch, max(batch.views.shape[1], self._padded_to))
         root = {"root_world": padded.root_world} if self.takes_root else {}
-        found = self._find(self._params, padded.views, padded.cameras, **root)
+        found = _apply(self._params, padded.views, padded.cameras, config=self._config, **root)
         return Answer(*map(np.asarray, (found.joints_world, found.vertices_world, found.valid)))
 
 

@@ -74,15 +74,17 @@ def as_json(result: TableResult) -> dict[str, Any]:
 
 def write_table(folder: str | os.PathLike, result: TableResult, picture: str | None = None) -> list[str]:
     """Write `NAME.md` and `NAME.json` into a folder; return their paths."""
-    texts = {
-        "md": as_markdown(result, picture),
-        "json": json.dumps(as_json(result), indent=2, allow_nan=False) + "\n",
-    }
-    paths = [os.path.join(folder, f"{result.name}.{suffix}") for suffix in texts]
-    for path, text in zip(paths, texts.values(), strict=True):
-        with whole_file(path) as file:
-            file.write_text(text, encoding="utf-8")
+    paths = [os.path.join(folder, f"{result.name}.{suffix}") for suffix in ("md", "json")]
+    with whole_file(paths[0]) as file:
+        file.write_text(as_markdown(result, picture), encoding="utf-8")
+    write_json(paths[1], result)
     return paths
+
+
+def write_json(path: str | os.PathLike, result: TableResult) -> None:
+    """Write `as_json`; the file appears whole or not at all."""
+    with whole_file(path) as file:
+        file.write_text(json.dumps(as_json(result), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def degrade_percent(numbers: Mapping[str, float], base: Mapping[str, float]) -> dict[str, float]:

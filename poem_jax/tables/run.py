@@ -123,7 +123,7 @@ def _line(table: str, row: Row, opened: _Opened, settings: RunSettings, files: l
         scores = score_set(system, data.source, _settings(row, settings), _listener(hands, data.source))
     except ValueError as error:
         return line._replace(absent=(f"could not be scored: {error}",))
-    notes = [*line.notes, *_notes(scores)]
+    notes = [*line.notes, *notes_of(scores)]
     if hands is not None:
         notes.append(_submit(hands, Path(settings.out) / f"{table}_submission.zip", files))
     return line._replace(
@@ -175,7 +175,7 @@ def _system_in_words(row: Row, opened: _Opened) -> str:
             return ""
 
 
-def _notes(scores: SetScores) -> list[str]:
+def notes_of(scores: SetScores) -> list[str]:
     """Say what a reader of the numbers must know of how they came about."""
     notes = [_JOINTS_ALONE] if scores.joints_alone else []
     if scores.unsolved:
