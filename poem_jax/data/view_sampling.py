@@ -6,7 +6,7 @@ but its seed.
 
 import re
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,6 +16,7 @@ RELEASE_MEAN, RELEASE_SPREAD = 4.0, 2.0
 """Of the number of views in POEM v2's released reader."""
 
 
+@runtime_checkable
 class ViewSampling(Protocol):
     """A rule by which views are drawn."""
 

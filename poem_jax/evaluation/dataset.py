@@ -8,7 +8,7 @@ is the first chosen camera, whose own label is the truth, as in training and in 
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -34,6 +34,7 @@ SAME_HAND_M = 0.015
 _log = logging.getLogger(__name__)
 
 
+@runtime_checkable
 class Change(Protocol):
     """What is done to a batch before it is given to the system: one of `evaluation.robustness`."""
 

@@ -8,8 +8,7 @@ MANO's order with the tips last, thumb to little, and 778 vertices.
 import json
 import os
 import zipfile
-from collections.abc import Sequence
-from typing import IO
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -64,15 +63,15 @@ class Ho3dSubmission:
             zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
             archive.open("pred.json", "w", force_zip64=True) as stream,
         ):
-            for bracket, rows in ((b"[", self._joints), (b",", self._vertices)):
-                stream.write(bracket)
-                _write_rows(stream, rows)
+            for start, rows in ((b"[", self._joints), (b",", self._vertices)):
+                stream.write(start)
+                stream.writelines(_json_of(rows))
             stream.write(b"]")
 
 
-def _write_rows(stream: IO[bytes], rows: Float[np.ndarray, "image point 3"]) -> None:
-    """Write a list of rows one by one: the text of all is several times as large as the numbers."""
+def _json_of(rows: Float[np.ndarray, "image point 3"]) -> Iterator[bytes]:
+    """Yield a list of rows piece by piece: the text of all is several times as large as the numbers."""
     for number, row in enumerate(rows.astype(np.float64).round(_DECIMALS)):
-        stream.write(b"," if number else b"[")
-        stream.write(json.dumps(row.tolist()).encode())
-    stream.write(b"]")
+        yield b"," if number else b"["
+        yield json.dumps(row.tolist()).encode()
+    yield b"]"

@@ -1,7 +1,7 @@
 """What is scored on a data set: anything that turns a batch of calibrated views into hands."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -34,6 +34,7 @@ class Seen(NamedTuple):
     """Of the frame, in the sample's order."""
 
 
+@runtime_checkable
 class System(Protocol):
     """A model with its weights, or a way to fit a hand."""
 

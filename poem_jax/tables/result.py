@@ -1,7 +1,7 @@
 """What a table comes to, whatever made it: lines with the paper's numbers and ours."""
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from poem_jax.tables.places import Places
 
@@ -44,6 +44,7 @@ class TableResult(NamedTuple):
     """Written besides, such as submissions."""
 
 
+@runtime_checkable
 class AnyTable(Protocol):
     """What `poem eval --table` runs."""
 

@@ -67,11 +67,15 @@ class _Opened:
             case Fitting():
                 return _or_message(lambda: self._fitting(system))
 
+    def no_weights(self, system: Checkpoint | Shipped | Fitting) -> str | None:
+        """Say how a checkpoint is made that is not there; nothing is loaded."""
+        if not isinstance(system, Checkpoint) or (self.places.checkpoints / system.name).is_dir():
+            return None
+        ways = "; or ".join(system.ways(self.places))
+        return f"no checkpoint in {self.places.checkpoints / system.name}: {ways}"
+
     def _network(self, checkpoint: Checkpoint) -> Network:
         folder = self.places.checkpoints / checkpoint.name
-        if not folder.is_dir():
-            ways = "; or ".join(checkpoint.ways(self.places))
-            raise FileNotFoundError(f"no checkpoint in {folder}: {ways}")
         config, expected = read_config(folder), preset(checkpoint.preset)
         if type(config) is not type(expected):
             raise ValueError(
@@ -107,17 +111,19 @@ def _line(table: str, row: Row, opened: _Opened, settings: RunSettings, files: l
         paper=row.paper,
         number=row.number,
         num_views=row.num_views,
-        series="" if isinstance(row.system, Quoted) else f"{row.data.title}, {_system_in_words(row, opened)}",
+        series=f"{row.data.title}, {row.system.name}" if isinstance(row.system, Checkpoint) else "",
         against=row.against,
         notes=(row.note,) if row.note else (),
     )
     if isinstance(row.system, Quoted):
         return line._replace(notes=(*line.notes, "the paper's number"))
     line = line._replace(what=_how(row, opened))
-    data, system = opened.data(row.data), opened.system(row.system)
-    absent = tuple(one for one in (data, system) if isinstance(one, str))
-    if isinstance(data, str) or isinstance(system, str):
-        return line._replace(absent=absent)
+    data, without = opened.data(row.data), opened.no_weights(row.system)
+    if isinstance(data, str) or without is not None:
+        return line._replace(absent=tuple(one for one in (data, without) if isinstance(one, str)))
+    system = opened.system(row.system)
+    if isinstance(system, str):
+        return line._replace(absent=(system,))
     hands = Ho3dSubmission(data.source.num_images) if row.official and isinstance(data.source, HO3D) else None
     try:
         scores = score_set(system, data.source, _settings(row, settings), _listener(hands, data.source))
