@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from poem_jax.data.view_sampling import AllViews, UniformViews, ViewSampling
 from poem_jax.evaluation.dataset import Change
+from poem_jax.evaluation.keypoint_fitting import Solver
 from poem_jax.tables.places import Places
 from poem_jax.tables.splits import OwnCapture, Split
 
@@ -45,8 +46,9 @@ class Shipped:
 
 @dataclass(frozen=True)
 class Fitting:
-    """Key-point fitting by the paper's Adam, without masks: the hand is MANO's where the user has it."""
+    """Key-point fitting without masks: the hand is MANO's where the user has it."""
 
+    solver: Solver
     keypoints: str | None = None
     """File of key points below the data's folder, taken where it is there (`evaluation.keypoint_fitting`);
     else, and for None, our detector looks for them."""

@@ -4,10 +4,10 @@ Sets and models are opened once for all rows that share them, so that each model
 views.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from poem_jax.data.frames import FrameSource
 from poem_jax.data.sources.ho3d import HO3D
@@ -20,13 +20,10 @@ from poem_jax.hand.mano_file import load as load_hand
 from poem_jax.hand.template import default_hand
 from poem_jax.models.presets import preset
 from poem_jax.tables.places import Places
-from poem_jax.tables.result import Line, RunSettings, TableResult
+from poem_jax.tables.result import Line, RunSettings
 from poem_jax.tables.row import Checkpoint, Fitting, Quoted, Row, Shipped
 from poem_jax.tables.splits import Opened, OwnCapture, Split
 from poem_jax.weights.store import SHIPPED, load, read_config
-
-if TYPE_CHECKING:
-    from poem_jax.tables.table import Table
 
 _Made = TypeVar("_Made")
 
@@ -35,16 +32,18 @@ _JOINTS_ALONE = (
 )
 
 
-def run_rows(table: "Table", places: Places, settings: RunSettings) -> TableResult:
-    """Run a table; see `Table.run`.
+def run_rows(
+    table: str, rows: Sequence[Row], places: Places, settings: RunSettings
+) -> tuple[tuple[Line, ...], tuple[str, ...]]:
+    """Return the lines of a table, and the files that were written besides.
 
     A row that cannot be scored, because its data are damaged, say, is listed with the reason like one whose
     data are missing, and the others run.
     """
     opened = _Opened(places)
     files: list[str] = []
-    lines = tuple(_line(table.name, row, opened, settings, files) for row in table.rows)
-    return TableResult(table.name, table.title, lines, table.notes, tuple(files))
+    lines = tuple(_line(table, row, opened, settings, files) for row in rows)
+    return lines, tuple(files)
 
 
 class _Opened:
@@ -87,7 +86,8 @@ class _Opened:
     def _fitting(self, fitting: Fitting) -> KeypointFitting:
         hand = load_hand(self.places.mano) if self.places.mano.is_file() else default_hand()
         file = self.keypoints(fitting)
-        return KeypointFitting(hand, None if file is None else read_keypoints(file))
+        keypoints = None if file is None else read_keypoints(file)
+        return KeypointFitting(hand, keypoints, solver=fitting.solver)
 
     def keypoints(self, fitting: Fitting) -> Path | None:
         """Return the file of key points, if it is there."""
@@ -176,7 +176,8 @@ def _system_in_words(row: Row, opened: _Opened) -> str:
             return "the shipped weights"
         case Fitting() as fitting:
             file = opened.keypoints(fitting)
-            return "Adam on key points of " + ("our detector" if file is None else str(file))
+            points = "our detector" if file is None else str(file)
+            return f"{fitting.solver.value} on key points of {points}"
         case _:
             return ""
 

@@ -20,4 +20,5 @@ class Table:
         """Run the rows whose data and weights are here; say of the others what is missing."""
         from poem_jax.tables.run import run_rows
 
-        return run_rows(self, places, settings)
+        lines, files = run_rows(self.name, self.rows, places, settings)
+        return TableResult(self.name, self.title, lines, self.notes, files)

@@ -40,7 +40,8 @@ def test_points_of_a_file_and_the_cameras_of_whole_images_fit_each_other(source,
     stored.pop("take/000001")
     asked = []
 
-    def fit(model, seen, *, config, diagonal_px):
+    def fit(model, seen, start, *, config, diagonal_px):
+        assert start.quaternions.shape == (2, 16, 4)
         asked.append((seen, diagonal_px))
         size = len(seen.uv_px)
         return type(

@@ -122,4 +122,4 @@ def test_numbers_are_the_papers(shared_dir) -> None:
                 printed.append(tuple(map(float, numbers)))
         table = TABLES[name]
         assert isinstance(table, Table)
-        assert [row.printed for row in table.rows] == printed
+        assert [row.printed for row in table.rows if row.printed] == printed
