@@ -106,6 +106,7 @@ def test_cameras_are_drawn_from_the_seed_alone() -> None:
         return [one.views.tolist() for one in system.seen]
 
     assert drawn(1, 2) == drawn(1, 3)
+    assert len(set(map(tuple, drawn(1, 2)))) > 2
     assert drawn(1, 2) != drawn(2, 2)
 
 

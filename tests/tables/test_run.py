@@ -85,15 +85,15 @@ def check_as_poem(line: Line, folder, frame, views) -> None:
 
 
 @pytest.mark.slow
-def test_v2_runs_on_all_five_sets(places) -> None:
-    result = run("v2", places)
+def test_v2_runs_on_all_five_sets(all_places) -> None:
+    result = run("v2", all_places)
     absent = [line for line in result.lines if line.ours is None]
     assert {line.label.split(" (")[0] for line in absent} == {"POEM v2-param"}
     assert len(result.lines) - len(absent) == 20
-    frame = ReleasedTars(places.tars / "Arctic_mv", split="val")[0]
+    frame = ReleasedTars(all_places.tars / "Arctic_mv", split="val")[0]
     views = np.random.default_rng((QUIET.seed, 0)).permutation(8)
     line = line_of(result, "ARCTIC-Mv", "POEM v2-large (8 cameras)")
-    check_as_poem(line, places.checkpoints / "v2-large", frame, views)
+    check_as_poem(line, all_places.checkpoints / "v2-large", frame, views)
 
 
 def test_row_9_of_v2_is_numpys(places) -> None:
@@ -142,14 +142,15 @@ def test_ho3d_submission_is_not_written_of_a_part(places, tmp_path) -> None:
     assert "no submission is written" in result.lines[-1].notes[-1]
 
 
-def test_single_view_gets_the_true_root(places) -> None:
-    line = run("single-view", places).lines[0]
+@pytest.mark.slow
+def test_single_view_gets_the_true_root(all_places) -> None:
+    line = run("single-view", all_places).lines[0]
     source = HO3D(
-        places.raw / "HO3D", split="evaluation-mv", version="v2", mano=places.mano, sequences=("SM1",)
+        all_places.raw / "HO3D", split="evaluation-mv", version="v2", mano=all_places.mano, sequences=("SM1",)
     )
     frame = source[0]
     truth, true_joints = frame.vertices_cam[0], frame.joints_cam[0]
-    joints, vertices, _ = found_by(places.checkpoints / "v2-base", frame, [0], true_joints[ROOT_JOINT])
+    joints, vertices, _ = found_by(all_places.checkpoints / "v2-base", frame, [0], true_joints[ROOT_JOINT])
     assert line.ours["pa_mpvpe_mm"] == pytest.approx(error_mm(aligned(vertices, truth), truth), rel=1e-4)
     assert line.ours["pa_mpjpe_mm"] == pytest.approx(
         error_mm(aligned(joints, true_joints), true_joints), rel=1e-4
@@ -180,8 +181,8 @@ def test_without_data_and_weights_every_row_says_what_to_download(name, tmp_path
 
 def test_a_checkpoint_of_another_system_is_not_scored(places, tmp_path) -> None:
     elsewhere = replace(places, checkpoints=tmp_path)
-    (tmp_path / "v1-dexycb").symlink_to(places.checkpoints / "v2-base")
-    line = run("robustness", elsewhere).lines[0]
+    (tmp_path / "v1-oakink").symlink_to(places.checkpoints / "v2-base")
+    line = line_of(run("robustness", elsewhere), "OakInk-Mv", "POEM v1")
     assert line.ours is None
     assert "holds a Config; expected a PoemV1Config" in line.absent[0]
 
@@ -198,15 +199,23 @@ def test_damaged_data_cost_their_rows_alone(places, tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_ho3d_v2_has_a_calibration_beside_it(all_places, tmp_path) -> None:
+    line = run("ho3d-v2", all_places, QUIET._replace(out=str(tmp_path))).lines[-1]
+    assert line.samples == 13
+    assert (tmp_path / "ho3d-v2_submission.zip").is_file()
+
+
+@pytest.mark.slow
 def test_main_and_ablation_run_and_one_row_each_is_numpys(places) -> None:
-    names = ("main", "ablation")
-    for row in (row for name in names for row in table_named(name).rows):
-        if isinstance(row.system, Checkpoint) and row.data.title == "OakInk-Mv":
+    only = [replace_rows(table_named(name), "OakInk-Mv") for name in ("main", "ablation")]
+    absent = {"v1-g-emb-oakink", "v1-gv-emb-oakink"}
+    for row in (row for table in only for row in table.rows):
+        if row.system.name not in absent:
             write_small(places, row.system.name, row.system.preset)
-    only = [replace_rows(table_named(name), "OakInk-Mv") for name in names]
     results = [table.run(places, QUIET) for table in only]
-    for result in results:
-        assert all(line.ours is not None for line in result.lines), [line.absent for line in result.lines]
+    for table, result in zip(only, results, strict=True):
+        for row, line in zip(table.rows, result.lines, strict=True):
+            assert (line.ours is None) == (row.system.name in absent), line.absent
     frame = ReleasedTars(places.tars / "Oakink_mv", split="test")[0]
     for result, label, model in zip(
         results, ("PE-MeshTR", "w/o-proj"), ("pe-meshtr", "v1-wo-proj"), strict=True
@@ -220,29 +229,29 @@ def replace_rows(table: Table, group: str) -> Table:
 
 
 @pytest.mark.slow
-def test_robustness_tells_what_shuffled_and_foreign_cameras_cost(places) -> None:
+def test_robustness_tells_what_shuffled_and_foreign_cameras_cost(all_places) -> None:
     for dataset in ("dexycb", "oakink", "ho3d"):
-        write_small(places, f"v1-{dataset}", "v1")
-    result = run("robustness", places)
+        write_small(all_places, f"v1-{dataset}", "v1")
+    result = run("robustness", all_places)
     assert all(line.ours is not None for line in result.lines)
-    frame = ReleasedTars(places.tars / "HO3D_mv_test", split="test")[0]
+    frame = ReleasedTars(all_places.tars / "HO3D_mv_test", split="test")[0]
     line = line_of(result, "HO3D-Mv", "trained on OakInk")
-    check_as_poem(line, places.checkpoints / "v1-oakink", frame, range(5))
+    check_as_poem(line, all_places.checkpoints / "v1-oakink", frame, range(5))
     shuffled = line_of(result, "DexYCB-Mv", "cameras shuffled")
     assert shuffled.ours["mpvpe_mm"] != line_of(result, "DexYCB-Mv", "POEM v1").ours["mpvpe_mm"]
 
 
 @pytest.mark.slow
-def test_real_world_compares_a_fit_to_key_points_with_networks(places) -> None:
-    source = table_named("real-world").rows[0].data.open(places).source
+def test_real_world_compares_a_fit_to_key_points_with_networks(all_places) -> None:
+    source = table_named("real-world").rows[0].data.open(all_places).source
     frames = [source[i] for i in range(len(source))]
-    file = places.data / "keypoints" / "real_world.npz"
+    file = all_places.data / "keypoints" / "real_world.npz"
     file.parent.mkdir()
     keys, points = [frame.key for frame in frames], [frame.keypoints_px for frame in frames]
     np.savez(file, keys=np.array(keys), keypoints_px=np.array(points))
     table = table_named("real-world")
     without_shipped = replace(table, rows=tuple(r for r in table.rows if not isinstance(r.system, Shipped)))
-    adam, fit, base = without_shipped.run(places, QUIET).lines
+    adam, fit, base = without_shipped.run(all_places, QUIET).lines
     for line in (adam, fit, base):
         assert line.samples == 2
     for line in (adam, fit):
@@ -251,6 +260,6 @@ def test_real_world_compares_a_fit_to_key_points_with_networks(places) -> None:
         assert line.ours["mpvpe_mm"] < 5 < base.ours["mpvpe_mm"]
     errors = []
     for frame in frames:
-        _, vertices, _ = found_by(places.checkpoints / "v2-base", frame, range(len(frame.images)))
+        _, vertices, _ = found_by(all_places.checkpoints / "v2-base", frame, range(len(frame.images)))
         errors.append(error_mm(vertices, frame.vertices_cam[0]))
     assert base.ours["mpvpe_mm"] == pytest.approx(np.mean(errors), rel=1e-4)
