@@ -445,6 +445,7 @@ _LATER = {
     "compute.precision": "float32",
     "compute.accumulate": 1,
     "data.mixture": None,
+    "data.synthetic.cameras.rig": [],
     "data.mixture.parts.*.held_out": 0.0,
     "frozen_views": False,
     "frozen_first_stage": False,
