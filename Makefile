@@ -6,9 +6,10 @@ STAMP := $(VENV)/.installed
 # What `make accelerator` may take, all in all.
 MINUTES ?= 10
 # Two workers: most of the suite is compiling, which keeps one core busy each.
+TABLE_SYSTEMS := v2 ftl-meshtr pe-meshtr mvp v1 v2-row-major v1-wo-pt v1-1stage v1-wo-proj v1-g-emb v1-gv-emb
 PYTEST := $(BIN)/python -m pytest -n 2
 
-.PHONY: setup demo test test-browser test-parity test-slow lint bench accelerator lock clean
+.PHONY: setup demo test test-browser test-parity test-slow lint bench accelerator synthetic-table lock clean
 .DEFAULT_GOAL := help
 
 help:
@@ -17,6 +18,7 @@ help:
 	@echo "make test    the default test suite (a quarter to half an hour on 2 cores)"
 	@echo "make lint    ruff and pyright"
 	@echo "make bench   print the speed tables of benchmarks/"
+	@echo "make synthetic-table   train the systems of the synthetic table, for days at the lowest priority"
 	@echo "make accelerator MINUTES=10   measure a GPU, then train the shipped model on"
 
 setup: $(STAMP)
@@ -54,6 +56,12 @@ bench: setup
 
 accelerator: setup
 	$(BIN)/python -m tools.accelerator --minutes $(MINUTES)
+
+# Every system twice; what was stopped goes on where it was.
+synthetic-table: setup
+	@for seed in 0 1; do for system in $(TABLE_SYSTEMS); do \
+	  nice -n 19 $(BIN)/poem train synthetic_table:$$system --train.seed $$seed \
+	    --train.out runs/synthetic_table_$$system-$$seed || exit 1; done; done
 
 lock: setup
 	$(BIN)/pip-compile --quiet --strip-extras --no-emit-options --no-emit-index-url --no-emit-find-links --extra dev --extra train --output-file requirements.lock pyproject.toml

@@ -30,6 +30,8 @@ GRADIENTS = {"tiny": (16, 4), "v1": (2, 8)}
 SHIPPED, SHIPPED_BATCH = "tiny_continued", (16, 4)
 DEVICES, SAMPLES_EACH = (1, 2, 4, 8), 4
 PROCESSES = 2
+BUFFERS_ALONE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+"""XLA assigns buffers before LLVM compiles: what is not run need not be optimised, for ten minutes."""
 
 
 def main() -> None:
@@ -101,7 +103,7 @@ def memory(given: argparse.Namespace) -> None:
     real = " peak of the process, GB | step, s |" if given.resident else ""
     print(f"| `v2-base`, 1 x 8 | kept, GB | beside state and batch, GB | state and batch, GB |{real}")
     print("|---|---|---|---|" + 2 * "---|" * given.resident)
-    options = {"name": "v2_base_synthetic", "samples": 1, "views": 8}
+    options: dict[str, Any] = {"name": "v2_base_synthetic", "samples": 1, "views": 8}
     for form in (
         "float32",
         "float32, trunk again",
@@ -109,7 +111,8 @@ def memory(given: argparse.Namespace) -> None:
         "bfloat16",
         "bfloat16, both again",
     ):
-        found = _do("measure_memory", 1, **options, thin=given.thin, form=form, resident=given.resident)
+        options |= {"thin": given.thin, "form": form, "resident": given.resident}
+        found = _result(_start("measure_memory", 1, options, "" if given.resident else BUFFERS_ALONE))
         real = f" {found['peak']:.2f} | {found['seconds']:.1f} |" if given.resident else ""
         needs = f"{found['kept']:.2f} | {found['temporary']:.2f} | {found['arguments']:.2f}"
         print(f"| {form} | {needs} |{real}", flush=True)
@@ -176,8 +179,8 @@ def _do_in_processes(**options: Any) -> Any:
     return first
 
 
-def _start(job: str, devices: int, options: dict[str, Any]) -> "subprocess.Popen[str]":
-    flags = f"--xla_force_host_platform_device_count={devices}"
+def _start(job: str, devices: int, options: dict[str, Any], flags: str = "") -> "subprocess.Popen[str]":
+    flags = f"--xla_force_host_platform_device_count={devices} {flags}"
     environment = {**os.environ, "GLIBC_TUNABLES": SETTINGS, "XLA_FLAGS": flags}
     command = [sys.executable, __file__, "--job", job, json.dumps(options)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)

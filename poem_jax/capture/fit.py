@@ -14,6 +14,7 @@ import numpy as np
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.lens_reach import beyond_the_lens
+from poem_jax.calibration.time_words import judge_time
 from poem_jax.calibration.view_agreement import judge_views
 from poem_jax.capture.agreement import check_each_camera
 from poem_jax.capture.fit_trust import joint_confidence
@@ -39,6 +40,8 @@ NOT_FITTED = "fewer than three joints, or only joints on one line, are seen by t
 
 _CONTEXT = 16
 """Frames before and after that a smoothed frame is held to; what lies farther does not move it."""
+_FRAMES_FOR_OFFSETS = 20
+"""Fewer do not tell whether the cameras' frames are of one moment; the first group with so many is asked."""
 _FRAMES_FOR_SHAPE = 16
 """A hand's shape is settled by the first group that shows it in so many frames."""
 
@@ -71,7 +74,7 @@ def fit_hands(
         _HandFit(name, _keypoint_models(hands, side, offsets), config)
         for name, side in zip(take.hand_names, take.hand_sides, strict=True)
     ]
-    checked = said = told = False
+    checked = said = told = timed = False
     for group, turns in _windows(frames, _CONTEXT if smooth else 0):
         raw, confidence = _observed(group)
         keypoints = ideal_keypoints(take.rig, raw)
@@ -79,11 +82,13 @@ def fit_hands(
         if not checked and shows_palms(raw):
             check_triangulation(take.rig, raw)
             checked = True
-        warnings = (
-            []
-            if said
-            else [str(finding) for finding in judge_views(take.rig, raw, time_s=known_times(group))]
-        )
+        moments, findings = known_times(group), []
+        if not said:
+            findings = judge_views(take.rig, raw, time_s=moments)
+            seen = np.isfinite(raw).all(-1).any((1, 2, 3)).sum()
+            if not findings and not timed and moments is not None and seen >= _FRAMES_FOR_OFFSETS:
+                findings, timed = judge_time(take.rig, raw, moments), True
+        warnings = [str(finding) for finding in findings]
         said = said or bool(warnings)
         if not told:
             lost = np.isfinite(raw).all(-1) & ~np.isfinite(keypoints).all(-1)

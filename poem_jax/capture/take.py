@@ -16,10 +16,11 @@ from poem_jax.capture.boxes_file import (
     read_boxes,
     without_boxes_outside,
 )
+from poem_jax.capture.camera_match import of_cameras
 from poem_jax.capture.frame import Frame
 from poem_jax.capture.moments import Moments, find_moments
 from poem_jax.capture.picked_frames import PickedFrames
-from poem_jax.capture.timing import Timing
+from poem_jax.capture.timing import Timing, read_sync
 from poem_jax.data.capture_folder import FramePaths, find_rig, frame_key, hand_names
 from poem_jax.geometry.rig import Rig
 from poem_jax.io.file_names import name_key, safe_file_names
@@ -178,19 +179,27 @@ def found_at(hands: HandBoxes, moments: Moments) -> HandBoxes:
 def _moments_of(
     hands: HandBoxes, folder: str | os.PathLike, rig: Rig, timing: Timing, path: str | os.PathLike
 ) -> Moments:
-    """List the moments of a capture under the offsets under which its hands were found.
+    """List the moments of a capture, under the offsets under which its hands were found if these are noted.
 
     Raises: ValueError: The offsets that are asked for are others; or as `find_moments`.
     """
-    asked = find_moments(folder, rig, timing)
-    if hands.offsets_s is None or asked.offsets_s is None:
-        return asked
+    if hands.offsets_s is None:
+        if any(timing.offsets_s.values()):
+            _log.warning(
+                "%s does not say under which offsets its hands were found: they are taken to be those given",
+                path,
+            )
+        return find_moments(folder, rig, timing)
+    asked = {
+        **read_sync(folder, rig.names).offsets_s,
+        **of_cameras(timing.offsets_s, rig.names, "--offsets"),
+    }
     by_key = dict(zip(map(name_key, hands.cameras or rig.names), hands.offsets_s.tolist(), strict=False))
     noted = {camera: by_key[name_key(camera)] for camera in rig.names if name_key(camera) in by_key}
-    other = [camera for camera in noted if abs(noted[camera] - asked.offsets_s[camera]) > _SAME_OFFSET_S]
+    other = [camera for camera in noted if abs(noted[camera] - asked.get(camera, 0.0)) > _SAME_OFFSET_S]
     if not other:
-        return asked
-    told = f"{other[0]}={noted[other[0]]:g}, not {asked.offsets_s[other[0]]:g}"
+        return find_moments(folder, rig, timing)
+    told = f"{other[0]}={noted[other[0]]:g}, not {asked.get(other[0], 0.0):g}"
     if timing.offsets_s:
         raise ValueError(
             f"{path}: its hands were found under other offsets ({told} s): move it away to search again, or "

@@ -236,6 +236,8 @@ class _Writer:
     def _write_page(self, about: Mapping[str, Any]) -> None:
         """Write the page if that can be done here; a warning says why not. The rest does not need it."""
         kept, style = self._pages.kept, self._style
+        if not kept:  # Stopped within the first frame that has hands.
+            return
         made = f"engine: {about['engine']}, {time.strftime('%d %B %Y, %H:%M')}"
         caption = Caption(self._out.resolve().name, made, page_facts(self.report, kept))
         more = {"caption": caption, "joint_weights": style.joint_weights()}

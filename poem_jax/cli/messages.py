@@ -4,6 +4,7 @@ Only warnings, errors and the end by a signal carry the prefix `poem:`.
 """
 
 import contextlib
+import errno
 import logging
 import shlex
 import sys
@@ -14,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from poem_jax.capture.write import Written
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What the system says where no more can be written."""
 
 
 def say(text: str) -> None:
@@ -54,13 +58,14 @@ class _Formatter(logging.Formatter):
 
 @contextlib.contextmanager
 def tells_what_is_left(out: Path) -> Iterator[None]:
-    """When the block is stopped, say whether anything was written to the folder or file `out` so far."""
+    """When the block is stopped, or the disk is full, say whether anything is in `out` so far."""
     start = time.time()
     try:
         yield
-    except KeyboardInterrupt:
-        written = _written_since(out, start)
-        say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
+    except (KeyboardInterrupt, OSError) as stop:
+        written, full = _written_since(out, start), isinstance(stop, OSError) and stop.errno in DISK_FULL
+        if isinstance(stop, KeyboardInterrupt) or (written and full):
+            say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
         raise
 
 
@@ -72,15 +77,20 @@ def _written_since(out: Path, start: float) -> bool:
 
 def print_files(written: "Written", out: Path) -> None:
     """List the files folder by folder; frames beyond the third in one line."""
+    from poem_jax.capture.write import CAPTURE, OVERLAYS
+
     folders: dict[Path, list[str]] = {}
     for path in written.files:
         folders.setdefault(path.parent, []).append(path.name)
-    frames = [folder for folder in folders if folder != out]
+    of_take = [out, *(out / name for name in (OVERLAYS, CAPTURE))]
+    frames = [folder for folder in folders if folder not in of_take]
     for folder in frames[:3]:
         print(f"{folder}/  {'  '.join(folders[folder])}")
     if len(frames) > 3:
         print(f"... and {len(frames) - 3} more frames like these")
-    print(f"{out}/  {'  '.join(folders.get(out, []))}")
+    for folder in reversed(of_take):
+        if folder in folders:
+            print(f"{folder}/  {'  '.join(folders[folder])}")
 
 
 def print_summary(report: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.inspect import Inspect
 from poem_jax.cli.live import Live
-from poem_jax.cli.messages import set_up_logging
+from poem_jax.cli.messages import DISK_FULL, set_up_logging
 from poem_jax.cli.pack import Pack
 from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.cli.retarget import Retarget
@@ -85,8 +85,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ModuleNotFoundError, FloatingPointError) as error:
         if command.debug:
             raise
-        print(f"poem: error: {error}", file=sys.stderr)
+        print(f"poem: error: {_told(error)}", file=sys.stderr)
         return USAGE_ERROR
+
+
+def _told(error: Exception) -> str:
+    """Return an error's text, in our words where the disk is full."""
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        where = f" at {error.filename}" if error.filename else ""
+        return f"the disk is full{where}: make room, or give another folder"
+    return str(error)
 
 
 def _run(command: Command) -> int:

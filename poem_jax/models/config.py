@@ -66,6 +66,16 @@ class Design(enum.StrEnum):
     RELEASE = "release"
 
 
+class Frozen(enum.StrEnum):
+    """What stays as it is while the rest learns, batch norms included."""
+
+    NOTHING = "nothing"
+    FIRST_STAGE = "first_stage"
+    """Trunk and heat maps."""
+    VIEWS = "views"
+    """All that is done with every view alone: these, and the maps that the second stage reads."""
+
+
 class Stem(enum.StrEnum):
     """How a ResNet reaches a quarter of the image's resolution."""
 

@@ -121,9 +121,12 @@ class MeshTransformer(nnx.Module):
         self.offsets = ReadOutNetwork(config.width, rngs=rngs)
         self.hand = HandConstants(hand)
 
-    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewMaps:
+    def look(
+        self, views: Num[Array, "*batch h w 3"], mode: NormMode, settled: NormMode | None = None
+    ) -> ViewMaps:
         """Do what is done with every view alone: trunk and feature map; any leading axes."""
-        levels = self.trunk(trunk_images(views, self.config, self.hand.model().v_template.dtype), mode)
+        images = trunk_images(views, self.config, self.hand.model().v_template.dtype)
+        levels = self.trunk(images, mode if settled is None else settled)
         maps = self.features(levels, mode)
         return ViewMaps(maps.reshape(*views.shape[:-3], *maps.shape[1:]))
 

@@ -126,9 +126,12 @@ class Mvp(DecoderRow):
         self.hand = HandConstants(hand)
         self.pose_components = Constant(jnp.asarray(finger_directions(hand)))
 
-    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewLevels:
+    def look(
+        self, views: Num[Array, "*batch h w 3"], mode: NormMode, settled: NormMode | None = None
+    ) -> ViewLevels:
         """Do what is done with every view alone: the trunk's three coarsest maps, at one width."""
-        maps = self.trunk(trunk_images(views, self.config, self.pose_components[...].dtype), mode)
+        images = trunk_images(views, self.config, self.pose_components[...].dtype)
+        maps = self.trunk(images, mode if settled is None else settled)
         levels = (reduce(x, mode) for reduce, x in zip(self.reduce, maps[::-1], strict=False))
         return ViewLevels(tuple(x.reshape(*views.shape[:-3], *x.shape[1:]) for x in levels))
 

@@ -18,7 +18,7 @@ from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.template import default_hand
-from poem_jax.models.config import ModelConfig
+from poem_jax.models.config import Frozen, ModelConfig
 from poem_jax.models.layers import Exact, NormMode, Row, recompute
 from poem_jax.models.systems import MODULES
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
@@ -55,6 +55,9 @@ class _ByValue:
         return hash(self.key)
 
 
+FIRST_STAGE = ("trunk", "heat_maps")
+"""The modules of a first stage, by their names in `params`; systems without heat maps have a trunk alone."""
+
 GROUPS = {"trainable": nnx.Param, "statistics": nnx.BatchStat, "constants": Constant}
 """Which kind of variable each part of `params` holds."""
 
@@ -78,8 +81,9 @@ class System(Protocol):
     config: Any
     hand: HandConstants
 
-    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> Any:
-        """Do everything that is done with every view alone.
+    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode, settled: NormMode | None = None) -> Any:
+        """Do everything that is done with every view alone; `settled`: the mode of trunk and heat maps, None
+        = `mode`.
 
         Returns: a NamedTuple of arrays, their leading axes those of the views.
         """
@@ -133,7 +137,7 @@ def forward(
     config: ModelConfig,
     root_world: Float[Array, "batch 3"] | None = None,
     train: bool = False,
-    frozen_views: bool = False,
+    frozen: Frozen = Frozen.NOTHING,
     key: PRNGKeyArray | None = None,
     ball_index: Int[Array, "batch point"] | None = None,
     draw_key: PRNGKeyArray | None = None,
@@ -149,8 +153,7 @@ def forward(
         config: the configuration that `params` were made with.
         root_world: as in `apply`, in training the noisy true root; NaN rows are triangulated.
         train: normalise by the moments of this batch's valid views and move the running statistics.
-        frozen_views: in training, do with every view alone what is done at inference, and let no gradient
-            into it.
+        frozen: in training, what does as at inference, and gets no gradient.
         key: in training, what dropout draws from; None = nothing is dropped.
         ball_index: as in `apply`.
         draw_key: the `key` of `apply`.
@@ -163,12 +166,12 @@ def forward(
         ValueError: a padded number of views that the system cannot take.
     """
     frame = enter_working_frame(views, cams, root_world, number_type(params))
-    model = assemble(config, params)
+    model = assemble(config, _settled(params) if frozen is Frozen.FIRST_STAGE else params)
     recompute(model, recomputed)
     mode = NormMode(frame.cams.view_mask.reshape(-1) if train else None, axis_name)
     draw = Draw.of(config, ball_index, draw_key)
     dropout_key = key if train else None
-    prediction = reconstruct(model, views, frame, mode, draw, dropout_key, frozen_views=frozen_views)
+    prediction = reconstruct(model, views, frame, mode, draw, dropout_key, frozen=frozen)
     return prediction, statistics(model) if train else params["statistics"]
 
 
@@ -180,15 +183,24 @@ def reconstruct(
     draw: Draw,
     dropout_key: PRNGKeyArray | None = None,
     *,
-    frozen_views: bool = False,
+    frozen: Frozen = Frozen.NOTHING,
 ) -> Prediction:
-    """Reconstruct one hand per sample in the user's world, from within the working frame; `frozen_views` as
-    in `forward`."""
+    """Reconstruct one hand per sample in the user's world, from within the working frame; `frozen` as in
+    `forward`."""
     check_view_count(model.config, views.shape[1])
     shown = jnp.where(frame.cams.view_mask[..., None, None, None], views, 0)
-    seen = model.look(shown, NormMode() if frozen_views else mode)
-    seen = jax.lax.stop_gradient(seen) if frozen_views else seen
+    if frozen is Frozen.VIEWS:
+        seen = jax.lax.stop_gradient(model.look(shown, NormMode()))
+    else:
+        seen = model.look(shown, mode, NormMode() if frozen is Frozen.FIRST_STAGE else None)
     return model.find_hands(seen, frame, mode, dropout_key=dropout_key, **draw.arguments())
+
+
+def _settled(params: Params) -> Params:
+    """Return the parameters, no gradient into those of the first stage."""
+    trainable = params["trainable"]
+    settled = {name: jax.lax.stop_gradient(trainable[name]) for name in FIRST_STAGE if name in trainable}
+    return {**params, "trainable": {**trainable, **settled}}
 
 
 def check_view_count(config: ModelConfig, num_views: int) -> None:

@@ -116,10 +116,13 @@ class PoemV1(nnx.Module):
             self.second = PaperTokens(config, hand, rngs=rngs)
         self.hand = HandConstants(hand)
 
-    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
+    def look(
+        self, views: Num[Array, "*batch h w 3"], mode: NormMode, settled: NormMode | None = None
+    ) -> ViewFeatures:
         """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
-        levels = self.trunk(trunk_images(views, self.config, self.hand.model().v_template.dtype), mode)
-        heat = (None, None) if self.heat_maps is None else self.heat_maps(levels, mode)
+        settled = mode if settled is None else settled
+        levels = self.trunk(trunk_images(views, self.config, self.hand.model().v_template.dtype), settled)
+        heat = (None, None) if self.heat_maps is None else self.heat_maps(levels, settled)
         seen = ViewFeatures(*heat, self.features(levels, mode), jnp.mean(levels[-1], (1, 2)))
         return jax.tree.map(lambda leaf: leaf.reshape(*views.shape[:-3], *leaf.shape[1:]), seen)
 

@@ -93,10 +93,13 @@ class Poem(nnx.Module):
         self.anchors = AnchorConstants(config, template) if is_release else None
         self.hand = HandConstants(hand)
 
-    def look(self, views: Num[Array, "*batch h w 3"], mode: NormMode) -> ViewFeatures:
+    def look(
+        self, views: Num[Array, "*batch h w 3"], mode: NormMode, settled: NormMode | None = None
+    ) -> ViewFeatures:
         """Do what is done with every view alone: trunk, heat maps and feature map; any leading axes."""
-        levels = self.trunk(trunk_images(views, self.config, self.basis_points[...].dtype), mode)
-        keypoints_px, heat_maps = self.heat_maps(levels, mode)
+        settled = mode if settled is None else settled
+        levels = self.trunk(trunk_images(views, self.config, self.basis_points[...].dtype), settled)
+        keypoints_px, heat_maps = self.heat_maps(levels, settled)
         said = None if self.joint_decoder is None else jnp.moveaxis(evidence(heat_maps), -1, -3)
         seen = ViewFeatures(keypoints_px, heat_maps, self.features(levels, heat_maps, mode), said)
         return jax.tree.map(lambda leaf: leaf.reshape(*views.shape[:-3], *leaf.shape[1:]), seen)

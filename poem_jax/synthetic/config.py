@@ -11,8 +11,22 @@ Range: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True)
+class StandingCamera:
+    """A camera of a rig, in its world: z up, metres."""
+
+    place_m: tuple[float, float, float]
+    looks_at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    roll_deg: float = 0.0
+    """About its axis; 0 = upright, and so many degrees turn the picture clockwise."""
+    field_of_view_deg: float = 60.0
+    """Of the frame's longer side."""
+    frame_wh: tuple[int, int] = (640, 480)
+
+
+@dataclass(frozen=True)
 class CameraConfig:
-    """Where cameras stand and what lenses they have; every view is drawn independently."""
+    """Where cameras stand and what lenses they have; every view is drawn independently, unless a rig stands
+    still and only the hand moves (`rig`; the other fields then say nothing)."""
 
     distance_m: Range = (0.3, 1.5)
     """From the camera to the hand; the direction is uniform on the sphere."""
@@ -27,6 +41,8 @@ class CameraConfig:
     aspect_sigma: float = 0.005
     """Spread of fy / fx around 1."""
     roll_deg: Range = (-180.0, 180.0)
+    rig: tuple[StandingCamera, ...] = ()
+    """Cameras that stand still in the sample's world, in whose order views come; () = none do."""
 
 
 @dataclass(frozen=True)

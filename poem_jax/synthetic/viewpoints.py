@@ -4,14 +4,20 @@ Every number of view v comes from row v of one table of uniform numbers, drawn r
 of a sample are the same however many there are.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from poem_jax.data.transforms import jitter_box, square_box
 from poem_jax.geometry.cameras import crop_intrinsics, project
-from poem_jax.geometry.transforms import rigid, rotation_about_z, smallest_rotation, unit_vectors
-from poem_jax.synthetic.config import CameraConfig, CropConfig, Range
+from poem_jax.geometry.transforms import (
+    rigid,
+    rotation_about_z,
+    smallest_rotation,
+    unit_vectors,
+)
+from poem_jax.synthetic.config import CameraConfig, CropConfig, Range, StandingCamera
 from poem_jax.typing import Array, Float, Int
 
 _NUMBERS = 16
@@ -41,23 +47,63 @@ def draw_viewpoints(
     num_views: int,
     out_hw: tuple[int, int],
 ) -> Viewpoints:
-    """Draw cameras that look at a hand, and the jittered box of the hand in each of them."""
+    """Draw cameras that look at a hand, or take those of the rig, and the jittered box of the hand in each.
+
+    Raises:
+        ValueError: more views than the rig has cameras.
+    """
     numbers = rng.random((num_views, _NUMBERS))
+    if cameras.rig:
+        if num_views > len(cameras.rig):
+            raise ValueError(
+                f"`num_views` must be at most the rig's {len(cameras.rig)} cameras; got {num_views}"
+            )
+        placed = standing_cameras(cameras.rig[:num_views])
+    else:
+        placed = _drawn_cameras(cameras, numbers, joints_world.mean(0))
+    K, frame_wh, T, camera_world = placed
+    keypoints_px = project(K, T, np.broadcast_to(joints_world, (num_views, *joints_world.shape)))[0]
+    box = square_box(keypoints_px, crop.expand_ratio)
+    box = jitter_box(box, _normals(numbers[:, 12:16])[:, :3], crop.center_jitter, crop.scale_jitter)
+    K_crop, frame = crop_intrinsics(K, box, out_hw), _frame(box, frame_wh, out_hw)
+    return Viewpoints(K, frame_wh, T, camera_world, box, K_crop, frame)
+
+
+_Placed: TypeAlias = tuple[
+    Float[Array, "view 3 3"], Int[Array, "view 2"], Float[Array, "view 4 4"], Float[Array, "view 3"]
+]
+"""K, sizes of the full frames, T_cam_from_world, and optical centres."""
+
+
+def standing_cameras(rig: Sequence[StandingCamera]) -> _Placed:
+    """Return cameras that stand still: K, sizes of their frames, T_cam_from_world, and where they stand."""
+    frame_wh = np.array([camera.frame_wh for camera in rig])
+    focal = frame_wh.max(-1) / 2 / np.tan(np.radians([camera.field_of_view_deg for camera in rig]) / 2)
+    K = np.zeros((len(rig), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = focal
+    K[:, :2, 2] = frame_wh / 2
+    K[:, 2, 2] = 1
+    place = np.array([camera.place_m for camera in rig])
+    forward = unit_vectors(np.array([camera.looks_at_m for camera in rig]) - place)
+    # Upright: x lies level, so that y, which is down in the image, is down in the world.
+    x = unit_vectors(np.cross(forward, [0.0, 0.0, 1.0]))
+    level = np.stack([x, np.cross(forward, x), forward], axis=-2)
+    R = rotation_about_z(np.radians([camera.roll_deg for camera in rig])) @ level
+    return K, frame_wh, rigid(R, -np.einsum("vij,vj->vi", R, place)), place
+
+
+def _drawn_cameras(
+    cameras: CameraConfig, numbers: Float[Array, "view n"], target_world: Float[Array, "3"]
+) -> _Placed:
     frame_wh = np.array(cameras.frames_wh)[(numbers[:, 0] * len(cameras.frames_wh)).astype(int)]
     K = _intrinsics(cameras, numbers[:, 1:6], frame_wh)
-    target_world = joints_world.mean(0)
     direction = directions_on_sphere(numbers[:, 6], numbers[:, 7])
     camera_world = target_world + direction * within(cameras.distance_m, numbers[:, 8])[:, None]
     seen_at = frame_wh / 2 * (1 + cameras.aim_jitter * (2 * numbers[:, 9:11] - 1))
     roll = np.radians(within(cameras.roll_deg, numbers[:, 11]))
     R = _look_along(-direction, roll)
     R = smallest_rotation(np.array([0.0, 0.0, 1.0]), _rays(K, seen_at)) @ R
-    T = rigid(R, -np.einsum("vij,vj->vi", R, camera_world))
-    keypoints_px = project(K, T, np.broadcast_to(joints_world, (num_views, *joints_world.shape)))[0]
-    box = square_box(keypoints_px, crop.expand_ratio)
-    box = jitter_box(box, _normals(numbers[:, 12:16])[:, :3], crop.center_jitter, crop.scale_jitter)
-    K_crop, frame = crop_intrinsics(K, box, out_hw), _frame(box, frame_wh, out_hw)
-    return Viewpoints(K, frame_wh, T, camera_world, box, K_crop, frame)
+    return K, frame_wh, rigid(R, -np.einsum("vij,vj->vi", R, camera_world)), camera_world
 
 
 def within(bounds: Range, uniform: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from poem_jax.losses import PAPER, LossRecipe
 from poem_jax.mixture.config import MixtureConfig
-from poem_jax.models.config import Config, DecoderOutput, ModelConfig, require
+from poem_jax.models.config import Config, DecoderOutput, Frozen, ModelConfig, require
 from poem_jax.synthetic.config import SyntheticConfig
 
 
@@ -195,6 +195,8 @@ class RunConfig:
     init_from: str | None = None
     """Folder of a model (`poem_jax.save`, `--export`) that a fresh run starts from; `shipped`: that of the
     package; None: random weights."""
+    first_stage_from: str | None = None
+    """Folder of a model, or `shipped`, whose trunk and heat maps a fresh run of another model starts from."""
     max_minutes: float | None = None
     """Stop after this time, with a checkpoint; the same command goes on from there."""
     log_every: int = 20
@@ -262,10 +264,44 @@ class TrainConfig:
     step: the second stage then starts from joints that mean something. Adam's moments start anew after."""
     frozen_views: bool = False
     """What is done with every view alone stays as it is, batch norms included; the second stage learns."""
+    frozen_first_stage: bool = False
+    """Trunk and heat maps stay as they are, batch norms included; the maps that the second stage reads
+    learn with it."""
     training_root: TrainingRoot = PAPER_ROOT
     optimizer: OptimizerConfig = OptimizerConfig()
     compute: ComputeConfig = ComputeConfig()
     train: RunConfig = RunConfig()
+
+    @property
+    def frozen(self) -> Frozen:
+        """What stays as it is."""
+        if self.frozen_views:
+            return Frozen.VIEWS
+        return Frozen.FIRST_STAGE if self.frozen_first_stage else Frozen.NOTHING
+
+    def _check_frozen(self) -> None:
+        run = self.train
+        if self.frozen is Frozen.NOTHING:
+            return
+        name = "frozen_views" if self.frozen_views else "frozen_first_stage"
+        require(
+            not (self.frozen_views and self.frozen_first_stage),
+            "`frozen_views` keeps all that `frozen_first_stage` does, and more; turn one of them off",
+        )
+        require(
+            not self.first_stage_steps,
+            f"`first_stage_steps` train what `{name}` keeps; got {self.first_stage_steps} of them",
+        )
+        given = run.init_from if self.frozen_views else run.init_from or run.first_stage_from
+        also = "" if self.frozen_views else " or `train.first_stage_from`"
+        require(
+            given is not None,
+            f"`{name}` keeps what `train.init_from`{also} gives; name a folder of weights, or `shipped`",
+        )
+        require(
+            not self.optimizer.weight_decay,
+            f"`optimizer.weight_decay` would shrink the weights that `{name}` keeps; set it to 0",
+        )
 
     def __post_init__(self) -> None:
         run, data = self.train, self.data.synthetic
@@ -304,17 +340,10 @@ class TrainConfig:
             "`model.crop.upright` is for models of upright hands; training crops are not turned upright",
         )
         require(
-            not (self.frozen_views and self.first_stage_steps),
-            f"`first_stage_steps` train what `frozen_views` keeps; got {self.first_stage_steps} of them",
+            run.init_from is None or run.first_stage_from is None,
+            f"`train.init_from` has a first stage; got `train.first_stage_from` {run.first_stage_from} too",
         )
-        require(
-            not self.frozen_views or run.init_from is not None,
-            "`frozen_views` keeps what `train.init_from` gives; name a folder of weights there, or `shipped`",
-        )
-        require(
-            not (self.frozen_views and self.optimizer.weight_decay),
-            "`optimizer.weight_decay` would shrink the weights that `frozen_views` keeps; set it to 0",
-        )
+        self._check_frozen()
         require(
             not self.first_stage_steps or self.model.triangulates,
             f"`first_stage_steps` must be 0 for a {type(self.model).__name__} without a first stage; "
@@ -416,8 +445,11 @@ _LATER = {
     "compute.precision": "float32",
     "compute.accumulate": 1,
     "data.mixture": None,
+    "data.synthetic.cameras.rig": [],
     "data.mixture.parts.*.held_out": 0.0,
     "frozen_views": False,
+    "frozen_first_stage": False,
+    "train.first_stage_from": None,
     "model.joint_decoder": None,
     "model.backbone.frozen_norms": "none",
     "loss.reprojection_limit": 0.5,

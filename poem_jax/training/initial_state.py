@@ -12,6 +12,7 @@ import numpy as np
 from poem_jax.models.apply import init
 from poem_jax.training.checkpoints import Checkpoints
 from poem_jax.training.config import TrainConfig, git_commit
+from poem_jax.training.first_stage import with_first_stage
 from poem_jax.training.hosts import check_same_everywhere, count_where
 from poem_jax.training.parallel import put_everywhere
 from poem_jax.training.state import TrainState, create_state
@@ -41,10 +42,17 @@ def initial_state(config: TrainConfig, checkpoints: Checkpoints, mesh: jax.shard
 
 
 def _first_params(config: TrainConfig) -> Params:
-    if config.train.init_from is not None:
-        folder = SHIPPED if config.train.init_from == "shipped" else config.train.init_from
-        return load(folder, expected=config.model)[1]
-    return init(config.model, key=jax.random.key(config.train.seed))
+    run = config.train
+    if run.init_from is not None:
+        return load(_folder(run.init_from), expected=config.model)[1]
+    params = init(config.model, key=jax.random.key(run.seed))
+    if run.first_stage_from is None:
+        return params
+    return with_first_stage(params, load(_folder(run.first_stage_from))[1], run.first_stage_from)
+
+
+def _folder(name: str) -> str | Path:
+    return SHIPPED if name == "shipped" else name
 
 
 def _digest(params: Params) -> str:

@@ -127,7 +127,7 @@ def _loss_share(
         config=config.model,
         root_world=part.root_world,
         train=True,
-        frozen_views=config.frozen_views,
+        frozen=config.frozen,
         key=part.key,
         draw_key=draw_key,
         axis_name=axis_name,

@@ -11,6 +11,7 @@ import pytest
 
 from poem_jax.calibration.epipolar import ideal_keypoints
 from poem_jax.calibration.rig_json import write_rig
+from poem_jax.capture import fit as fitting_stage
 from poem_jax.capture.boxes_file import HandBoxes, boxes_from_keypoints, write_boxes
 from poem_jax.capture.fit import _windows, fit_hands
 from poem_jax.capture.frame import Frame
@@ -29,6 +30,7 @@ from poem_jax.hand.pair import hands_of
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO
 from poem_jax.synthetic.keypoint_takes import draw_keypoint_take
+from tests.calibration.test_linter import moving_take
 from tests.capture.stub_network import lost_network
 
 FRAMES, VIEWS, SIDES = 6, 4, ("right", "left")
@@ -196,6 +198,20 @@ def test_a_turned_camera_is_named(take, tmp_path, caplog):
     assert "turned by 4.1 degrees" in said
     assert not any(f"'cam_{view}'" in said for view in (0, 1, 3))
     assert written.arrays["valid"].all()
+
+
+def test_a_camera_that_was_late_is_named_where_the_views_agree(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(fitting_stage, "judge_views", lambda *_, **__: [])
+    rig, keypoints = moving_take((0.0, 0.8, 0.0, 0.0))
+    frames = tuple(f"{frame:04d}" for frame in range(len(keypoints)))
+    hands = HandBoxes(boxes_from_keypoints(keypoints), ("right",), frames, keypoints)
+    timed = hands._replace(time_s=np.arange(len(keypoints)) / 25)
+    for given, said in ((timed, 1), (hands, 0)):
+        caplog.clear()
+        paths = [FramePaths(name, (None,) * rig.num_views) for name in frames]
+        with caplog.at_level(logging.WARNING):
+            fit(make_take(rig, paths, given), tmp_path, progress=False)
+        assert caplog.text.count("not of one moment: 'front' +0.8") == said
 
 
 def test_a_right_rig_is_not_complained_about(take, tmp_path, caplog):

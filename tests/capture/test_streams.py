@@ -98,6 +98,19 @@ def test_what_was_done_is_left(make_capture, tmp_path, caplog, stop):
     assert "holds the first 4 frames" in caplog.text
 
 
+def test_a_stop_within_the_first_frame_leaves_the_report(make_capture, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(page.PageFrames, "offer", stop)
+    take = read_take(make_capture().folder)
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(take, out, network=flat_network(), progress=False)
+    assert json.loads((out / "report.json").read_text())["stopped_by"] == "KeyboardInterrupt"
+    assert not (out / "index.html").exists()
+
+
 def test_nothing_is_left_where_nothing_was_done(make_capture, tmp_path):
     def at_frame(index):
         raise KeyboardInterrupt

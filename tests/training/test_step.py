@@ -278,6 +278,22 @@ def test_frozen_views_leave_all_that_looks_at_one_view(micro_params, config, mic
     np.testing.assert_allclose(metrics["keypoint_px"], error, rtol=1e-4)
 
 
+def test_a_frozen_first_stage_leaves_trunk_and_heat_maps(micro_params, config, micro_batch):
+    """The maps that the second stage reads learn, with the moments of the batch."""
+    run = replace(config.train, first_stage_from="somewhere")
+    frozen = replace(config, frozen_first_stage=True, train=run)
+    state = create_state(micro_params, frozen)
+    before = jax.tree.map(np.asarray, state.params)
+    step, after = jax.jit(partial(train_step, config=frozen)), state
+    for _ in range(2):  # The offsets begin at zero, and what is before them without a gradient.
+        after, _ = step(after, micro_batch, KEY)
+    for group in ("trainable", "statistics"):
+        for name in ("trunk", "heat_maps"):
+            jax.tree.map(np.testing.assert_array_equal, after.params[group][name], before[group][name])
+    moved = jax.tree.map(lambda a, b: np.any(a != b), after.params["trainable"], before["trainable"])
+    assert any(jax.tree.leaves(moved["features"]))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -64,7 +64,8 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
         model = with_joint_decoder(model)
     train = config.train
     shared_by = train.host_devices * config.compute.accumulate
-    init_from = None if train.init_from is None else _write_weights(model, folder / "weights")
+    begun = train.init_from or train.first_stage_from
+    weights = None if begun is None else _write_weights(model, folder / "weights")
     return replace(
         config,
         model=model,
@@ -75,7 +76,8 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
             steps=STEPS,
             seed=train.seed,
             out=str(folder / "run"),
-            init_from=init_from,
+            init_from=weights if train.init_from else None,
+            first_stage_from=weights if train.first_stage_from else None,
             log_every=1,
             checkpoint_every=1,
             keep_best=train.keep_best,

@@ -1,0 +1,34 @@
+"""One first stage for several systems: what is lent, and what is said where it does not fit."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.models.apply import init
+from poem_jax.training.first_stage import with_first_stage
+from poem_jax.weights.store import flatten
+from tests.micro import MICRO
+
+
+@pytest.fixture(scope="module")
+def lent():
+    return init(MICRO, key=jax.random.key(1))
+
+
+def test_trunk_and_heat_maps_come_from_the_other_model_and_the_rest_stays(lent):
+    other = replace(MICRO, decoder=replace(MICRO.decoder, num_layers=1))
+    fresh = init(other, key=jax.random.key(2))
+    ours, theirs, got = flatten(fresh), flatten(lent), flatten(with_first_stage(fresh, lent, "donor"))
+    assert ours.keys() == got.keys()
+    for name, leaf in got.items():
+        source = theirs if name.split(".")[1] in ("trunk", "heat_maps") else ours
+        np.testing.assert_array_equal(leaf, source[name])
+    assert any(name.startswith("statistics.trunk") for name in got)
+
+
+def test_another_trunk_is_refused_by_name(lent):
+    wider = replace(MICRO, backbone=replace(MICRO.backbone, channels=(16, 32)))
+    with pytest.raises(ValueError, match=r"donor must have this model.s trunk.*expected \w+\.trunk"):
+        with_first_stage(init(wider, key=jax.random.key(2)), lent, "donor")
