@@ -14,6 +14,7 @@ FLOORS = {
     "experiments": 9,
     "training": 8,
     "capture": 8,
+    "tables": 8,
     "evaluation": 7,
     "weights": 7,
     "miniatures": 7,

@@ -3,12 +3,14 @@
 import dataclasses
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from poem_jax.cli.inspect import Kinds
 from poem_jax.cli.messages import say
-from poem_jax.cli.options import Experiment, Flag, OptionalFile, OptionalFolder
+from poem_jax.cli.options import Flag, Folder, OptionalFile, OptionalFolder
 
 if TYPE_CHECKING:
     from poem_jax.hand.model import HandModel
@@ -19,32 +21,60 @@ if TYPE_CHECKING:
     from poem_jax.typing import Params
 
 
+_DEFAULT_VIEWS = "1,2,4,8"
+_DEFAULT_SAMPLES = 200
+_OUT = Path("out/tables")
+
+
 @dataclass(frozen=True)
 class Eval:
-    """Evaluate a model on synthetic captures: the paper's columns by view count, and which stage fails.
+    """Evaluate a model: on synthetic captures (EXPERIMENT), on a data set (--dataset), or all of a table of
+    the paper (--table); one of the three.
+
+    EXPERIMENT prints the paper's columns by view count, and which stage fails. --table runs the rows whose
+    data and weights are here, and lists what to download for the others; see docs/tables.md.
 
     The joints of every column are the model's direct predictions. Only --protocol poem-release takes them for
     AUC alone, and joints regressed from the vertices of both sides for MPJPE, RR-J and PA-J, as POEM's
     released evaluation does.
     """
 
-    experiment: Experiment
+    experiment: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")] = None
     """An experiment of the package, such as tiny_synthetic, or a Python file that defines `config`; it names
     the model and the distribution of captures."""
+    table: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """main, ablation, robustness, v2, ho3d-v2, ho3d-v3, single-view or real-world."""
+    dataset: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
+    """Tars, the folder of a raw set, or a labelled capture; with --table real-world, its capture."""
     checkpoint: OptionalFolder = None
     """Model folder that poem_jax.save or `poem train --export` wrote; without it the shipped weights."""
     protocol: Literal["poem", "poem-release", "freihand", "ho3d", "dexycb"] = "poem"
     """Whose definitions."""
-    views: Annotated[str, tyro.conf.arg(metavar="N,N")] = "1,2,4,8"
-    """View counts."""
+    views: Annotated[str | None, tyro.conf.arg(metavar="N,N")] = None
+    """View counts of captures (1,2,4,8). Of a data set: all, 4 (the first four), random (all, in random
+    order), random:4 or random:2-8; without it all."""
     seed: int = 20261122
-    """Of the captures."""
-    samples: int = 200
-    """Captures."""
+    """Of the captures, or of what is drawn of a data set's cameras."""
+    samples: int | None = None
+    """Captures (200), or samples of a data set, evenly spread over it; without it all."""
     batch_size: int = 8
     """Captures at a time."""
     json: OptionalFile = None
-    """Write all metrics there, by view count."""
+    """Write all metrics there: of captures by view count, of a data set as a table's row."""
+    out: Folder = _OUT
+    """With --table: folder for NAME.md, NAME.json, NAME.png and a submission of HO-3D's."""
+    data_root: Folder = Path("data")
+    """With --table: folder with dataset_tars/, raw/, mano/MANO_RIGHT.pkl."""
+    checkpoints: Folder = Path("checkpoints")
+    """With --table: folder of the models' folders."""
+    kind: Kinds | None = None
+    """With --dataset: what PATH is; found out where it is not said."""
+    split: str | None = None
+    """With --dataset: without it the paper's test split; tars say theirs in their names."""
+    mano: OptionalFile = None
+    """With --dataset: your MANO_RIGHT.pkl, where labels need it."""
+    given_root: Flag = False
+    """With --dataset: give the model the true root; a sample of one view gets it in any case."""
     stages: Flag = False
     """Print, too, which stage does the work: errors after each layer, and with features, root or joints
     replaced (for 2 views or more, on whole batches of captures; not in the JSON file)."""
@@ -54,7 +84,75 @@ class Eval:
     """Show the full traceback of an error."""
 
     def run(self) -> None:
-        """Evaluate, print the tables, and write the file."""
+        """Evaluate, print the tables, and write the files."""
+        captures_of_a_table = self.table is not None and self.dataset is not None
+        asked = [self.experiment, self.table, None if captures_of_a_table else self.dataset]
+        if sum(one is not None for one in asked) != 1:
+            raise ValueError(
+                "say one of EXPERIMENT, --table NAME and --dataset PATH; got "
+                f"{', '.join(one for one in asked if one is not None) or 'none'}"
+            )
+        if self.table is not None:
+            self._run_table(self.table)
+        elif self.dataset is not None:
+            self._run_dataset(self.dataset)
+        else:
+            assert self.experiment is not None
+            self._run_experiment(self.experiment)
+
+    def _run_table(self, name: str) -> None:
+        from poem_jax.io.writable import check_folder_is_writable
+        from poem_jax.tables.all_tables import table_named
+        from poem_jax.tables.layout import as_markdown, write_table
+        from poem_jax.tables.picture import write_picture
+        from poem_jax.tables.places import Places
+        from poem_jax.tables.result import RunSettings
+
+        table = table_named(name)
+        if self.dataset is not None and name != "real-world":
+            raise ValueError(f"--dataset goes with --table real-world, or without a table; got {name}")
+        check_folder_is_writable(self.out)
+        places = Places(
+            self.data_root, self.checkpoints, None if self.dataset is None else Path(self.dataset)
+        )
+        settings = RunSettings(
+            str(self.out), self.samples, self.batch_size, self.seed, progress=not self.no_progress
+        )
+        result = table.run(places, settings)
+        picture = f"{name}.png"
+        write_picture(self.out / picture, result)
+        paths = write_table(self.out, result, picture)
+        print(as_markdown(result))
+        for path in (*paths, self.out / picture, *result.files):
+            print(f"written: {path}")
+
+    def _run_dataset(self, path: str) -> None:
+        from poem_jax.data.view_sampling import cameras_named
+        from poem_jax.evaluation.dataset import SetSettings
+        from poem_jax.io.writable import check_file_is_writable
+        from poem_jax.mixture.recognise import Kind
+        from poem_jax.tables.layout import as_markdown, write_json
+        from poem_jax.tables.own_set import open_path, score_path
+
+        if self.json is not None:
+            check_file_is_writable(self.json, "--json")
+        settings = SetSettings(
+            cameras=cameras_named(self.views or "all"),
+            protocol=self.protocol,
+            given_root=self.given_root,
+            samples=self.samples,
+            batch_size=self.batch_size,
+            seed=self.seed,
+            progress=not self.no_progress,
+        )
+        kind = None if self.kind is None else Kind(self.kind)
+        source = open_path(path, kind, split=self.split, mano=self.mano)
+        result = score_path(source, self.checkpoint, settings)
+        if self.json is not None:
+            write_json(self.json, result)
+        print(as_markdown(result))
+
+    def _run_experiment(self, experiment: str) -> None:
         from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
         from poem_jax.evaluation.protocols import PROTOCOLS
         from poem_jax.evaluation.stages import check_has_stages
@@ -64,31 +162,32 @@ class Eval:
         from poem_jax.synthetic.dataset import SyntheticDataset
         from poem_jax.weights.store import SHIPPED, load
 
+        views = view_counts(self.views or _DEFAULT_VIEWS)
+        samples = _DEFAULT_SAMPLES if self.samples is None else self.samples
         if self.json is not None:
             check_file_is_writable(self.json, "--json")
-        if self.stages and (
-            max(view_counts(self.views)) < 2 or self.batch_size < 2 or self.samples < self.batch_size
-        ):
+        if self.stages and (max(views) < 2 or self.batch_size < 2 or samples < self.batch_size):
             raise ValueError(
                 "--stages needs a view count of 2 or more, and --samples of at least one batch of 2 or more; "
-                f"got --views {self.views}, --samples {self.samples}, --batch-size {self.batch_size}"
+                f"got --views {self.views or _DEFAULT_VIEWS}, --samples {samples}, "
+                f"--batch-size {self.batch_size}"
             )
         settings = BenchmarkSettings(
-            views=view_counts(self.views),
-            samples=self.samples,
+            views=views,
+            samples=samples,
             seed=self.seed,
             batch_size=self.batch_size,
             protocol=self.protocol,
             progress=not self.no_progress,
         )
-        config = open_experiment(self.experiment)
+        config = open_experiment(experiment)
         if self.stages:
             check_has_stages(config.model)
         captures = SyntheticDataset(captures_config(config), seed=self.seed)
         weights = self.checkpoint or SHIPPED
         _, params = load(weights, expected=config.model)
         hand = hand_of_captures(params)
-        say(f"{self.samples} captures; every view count compiles a program, once on this machine")
+        say(f"{samples} captures; every view count compiles a program, once on this machine")
         start = time.perf_counter()
         results = run_benchmark(model_predictor(params, config.model), captures, settings, hand)
         seconds = time.perf_counter() - start
@@ -96,25 +195,32 @@ class Eval:
             write_json(self.json, results)
         seen = ", which is the TRAINING seed" if self.seed == config.data.seed else ""
         print(f"{config.name}: weights {weights}, protocol {self.protocol}")
-        print(f"{self.samples} synthetic captures of seed {self.seed}{seen}; {seconds:.0f} s\n")
+        print(f"{samples} synthetic captures of seed {self.seed}{seen}; {seconds:.0f} s\n")
         print(format_report(results, regressed_joints=PROTOCOLS[self.protocol].regresses_joints))
         if self.stages:
-            self._print_stages(params, config.model, captures)
+            self._print_stages(params, config.model, captures, views, samples)
 
-    def _print_stages(self, params: "Params", model: "ModelConfig", captures: "SyntheticDataset") -> None:
+    def _print_stages(
+        self,
+        params: "Params",
+        model: "ModelConfig",
+        captures: "SyntheticDataset",
+        views: tuple[int, ...],
+        samples: int,
+    ) -> None:
         from poem_jax.evaluation.stages import format_stages, stage_errors
 
-        samples, size = self.samples - self.samples % self.batch_size, self.batch_size
+        samples, size = samples - samples % self.batch_size, self.batch_size
         say(f"{samples} captures again, each part of the model replaced in turn")
         print()
         print(
             format_stages(
                 {
-                    views: stage_errors(
-                        params, model, captures, samples=samples, num_views=views, batch_size=size
+                    count: stage_errors(
+                        params, model, captures, samples=samples, num_views=count, batch_size=size
                     )
-                    for views in view_counts(self.views)
-                    if views > 1
+                    for count in views
+                    if count > 1
                 }
             )
         )

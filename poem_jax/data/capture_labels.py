@@ -12,7 +12,8 @@
     valid (F,H), cameras (V,), reprojection_px (F,H,V)     as `poem fit` writes them; may be left out
 
 Either joints and vertices are there (pose and shape may be), or pose, shape and translation of MANO with the
-user's MANO file, and joints and vertices are made of them. Those of a long take stay on disk.
+user's MANO file, and joints and vertices are made of them. Those of a long take stay on disk. To evaluate,
+not to train, joints alone will do.
 """
 
 from collections.abc import Mapping
@@ -52,13 +53,17 @@ class CaptureLabels:
     """The vertices; None = they are made of the pose."""
     _hands: Mapping[str, HandModel]
     """By side, where vertices are made."""
+    joints_alone: bool = False
+    """There are no vertices, and nothing to make them of."""
 
     def vertices(self, frame: int, hand: int) -> Float[Array, "778 3"]:
-        """Return the vertices of a hand that has a label, metres in the world.
+        """Return the vertices of a hand that has a label, metres in the world; NaN for `joints_alone`.
 
         Raises:
             OSError, ValueError: The file is gone or has changed.
         """
+        if self.joints_alone:
+            return np.full((NUM_VERTICES, 3), np.nan, np.float32)
         if self._stored is not None:
             return self._stored[frame][hand]
         posed = {name: values[frame, hand] for name, values in self.mano.items()}
@@ -89,11 +94,14 @@ def find_labels(folder: Path) -> Path:
     return found
 
 
-def read_labels(path: str | Path, *, mano: str | Path | None = None) -> CaptureLabels:
+def read_labels(
+    path: str | Path, *, mano: str | Path | None = None, joints_alone: bool = False
+) -> CaptureLabels:
     """Read labels.
 
     Args:
         path: The npz.
+        joints_alone: Take `joints_world` without vertices, if the file has nothing to make these of.
         mano: The user's MANO file of either side, whose mirror image serves the other; needed where the file
             has no vertices.
 
@@ -107,7 +115,9 @@ def read_labels(path: str | Path, *, mano: str | Path | None = None) -> CaptureL
     if not sides or not set(sides) <= set(_SIDES):
         raise ValueError(f"{path}: `hand_side (H,)` must hold 'left' or 'right'; got {list(sides)}")
     has_mesh = all(name in arrays for name in _MESH)
-    needed = _MESH if has_mesh else _MANO
+    has_mano = all(name in arrays for name in _MANO) and mano is not None
+    joints_alone = joints_alone and not (has_mesh or has_mano) and "joints_world" in arrays
+    needed = {"joints_world": _MESH["joints_world"]} if joints_alone else _MESH if has_mesh else _MANO
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise ValueError(
@@ -124,8 +134,8 @@ def read_labels(path: str | Path, *, mano: str | Path | None = None) -> CaptureL
                 f"{arrays[name].shape} of {arrays[name].dtype}"
             )
     parameters = {name: arrays[name].astype(np.float32) for name in _MANO if name in arrays}
-    hands = {} if has_mesh else _hands_of(path, mano)
-    joints = arrays["joints_world"] if has_mesh else _joints(parameters, hands, sides)
+    hands = {} if has_mesh or joints_alone else _hands_of(path, mano)
+    joints = _joints(parameters, hands, sides) if hands else arrays["joints_world"]
     if "valid" in arrays:
         valid = _shaped(arrays["valid"], "valid", (count, len(sides)), path).astype(bool)
         joints = np.where(valid[..., None, None], joints, np.nan)
@@ -143,6 +153,7 @@ def read_labels(path: str | Path, *, mano: str | Path | None = None) -> CaptureL
         arrays.get("reprojection_px"),
         NpzRows(path, "vertices_world") if has_mesh else None,
         hands,
+        joints_alone,
     )
 
 

@@ -64,6 +64,7 @@ class MultiViewFrame(NamedTuple):
     joints_cam: Float[Array, "view 21 3"]
     """Each view's own label, metres in that camera's frame."""
     vertices_cam: Float[Array, "view 778 3"]
+    """NaN throughout where labels are joints alone, which a source gives only if it is asked to."""
     keypoints_px: Float[Array, "view 21 2"]
     """The joints in each image, also where they lie outside."""
     pose_cam: Float[Array, "view 16 3"] | None = None
@@ -133,26 +134,31 @@ class TakesSource(FrameSource, Protocol):
         ...
 
 
-def check_frame(frame: MultiViewFrame, path: str | Path) -> MultiViewFrame:
+def check_frame(frame: MultiViewFrame, path: str | Path, *, joints_alone: bool = False) -> MultiViewFrame:
     """Return the frame if it can be true, and round nothing.
+
+    Args:
+        frame: what a source has made.
+        path: where it comes from, for messages.
+        joints_alone: its labels have no vertices; these are not looked at.
 
     Raises: CorruptSampleError: numbers that are not finite, K that is no camera, extrinsics that are not
         rigid, a hand behind a camera or of a size that no hand has, numbers that do not fit each other.
     """
-    problem = next(_problems(frame), None)
+    problem = next(_problems(frame, ("joints_cam",) if joints_alone else _POINTS), None)
     if problem is not None:
         raise CorruptSampleError(path, frame.key, problem)
     return frame
 
 
-def _problems(frame: MultiViewFrame) -> Iterator[str]:
+def _problems(frame: MultiViewFrame, points_of: tuple[str, ...]) -> Iterator[str]:
     """Yield what is wrong, one line each."""
     views = len(frame.images)
     if not views:
         yield "it has no image"
     for name, tail in _TAILS.items():
         value = getattr(frame, name)
-        if value is None:
+        if value is None or (name in _POINTS and name not in points_of):
             continue
         if np.shape(value) != (views, *tail):
             yield f"`{name}` must have shape {(views, *tail)} for {views} images; got {np.shape(value)}"
@@ -182,7 +188,7 @@ def _problems(frame: MultiViewFrame) -> Iterator[str]:
         bad = (frame.box_px[:, :2] >= frame.box_px[:, 2:]).any(-1)
         if bad.any():
             yield f"`box_px` is not x0 y0 x1 y1 with x0 < x1 and y0 < y1 in {_views(frame, bad)}"
-    for name in ("joints_cam", "vertices_cam"):
+    for name in points_of:
         points = getattr(frame, name)
         extent = np.linalg.norm(points - points.mean(1, keepdims=True), axis=-1).max(-1)
         bad = (2 * extent < HAND_EXTENT_M[0]) | (2 * extent > HAND_EXTENT_M[1])
@@ -205,6 +211,7 @@ def _problems(frame: MultiViewFrame) -> Iterator[str]:
     )
 
 
+_POINTS = ("joints_cam", "vertices_cam")
 _TAILS = {
     "size_wh": (2,),
     "K": (3, 3),

@@ -4,8 +4,9 @@ Every rule draws indices into the frame's views from a given generator, so that 
 but its seed.
 """
 
+import re
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +16,7 @@ RELEASE_MEAN, RELEASE_SPREAD = 4.0, 2.0
 """Of the number of views in POEM v2's released reader."""
 
 
+@runtime_checkable
 class ViewSampling(Protocol):
     """A rule by which views are drawn."""
 
@@ -100,6 +102,47 @@ class FixedViews:
     ) -> Int[Array, " chosen"]:
         """Return the first ones; nothing is drawn."""
         return AllViews().draw(min(self.count, num_views), rng, most)
+
+
+def cameras_named(text: str) -> "AllViews | FixedViews | UniformViews":
+    """Return the rule that an option names: `all`, `4` (the first four), `random` (all, in random order),
+    `random:4`, `random:2-8`.
+
+    Raises:
+        ValueError: it names none.
+    """
+    form = re.fullmatch(r"(all)|(\d+)|random(?::(\d+)(?:-(\d+))?)?", text.strip())
+    if form is None:
+        raise ValueError(
+            f"cameras are `all`, `4` (the first four), `random`, `random:4` or `random:2-8`; got {text!r}"
+        )
+    everything, first, low, high = form.groups()
+    if everything:
+        return AllViews()
+    if first:
+        return FixedViews(int(first))
+    return UniformViews(_EVERY) if low is None else UniformViews(int(low), int(high or low))
+
+
+def cameras_in_words(rule: ViewSampling) -> str:
+    """Say in a few words which cameras a rule takes."""
+    match rule:
+        case FixedViews(count):
+            return f"the first {count}"
+        case UniformViews(low, None) if low >= _EVERY:
+            return "all, in random order"
+        case UniformViews(low, high) if low == high:
+            return f"{low} at random"
+        case UniformViews(low, high):
+            return f"{low} to {'all' if high is None else high} at random"
+        case ReleaseNormalViews(low, high):
+            return f"N(4, 2) held to {low}..{high}, at random"
+        case _:
+            return "all"
+
+
+_EVERY = 2**16
+"""More views than any frame has."""
 
 
 def _check_range(low: int, high: int | None) -> None:

@@ -84,6 +84,29 @@ def evaluate(
     return _scores(_regressed(pred, hand), _regressed(gt, hand), rules) | areas
 
 
+def evaluate_joints(
+    pred_joints: Num[Array, "..."], gt_joints: Num[Array, "..."], *, protocol: str
+) -> dict[str, float]:
+    """Return those metrics of `evaluate` that are of the joints given, for labels without a mesh.
+
+    `poem-release`, which regresses its joints from meshes, has none of these but the areas: it is refused.
+    Args and errors as for `evaluate`.
+    """
+    rules = find_protocol(protocol)
+    if rules.regresses_joints:
+        raise ValueError(f"protocol {protocol!r} regresses joints from labelled vertices, and there are none")
+    points = {"pred_joints": pred_joints, "gt_joints": gt_joints}
+    points = {name: _checked(name, value) * rules.units_per_metre for name, value in points.items()}
+    pred, gt = points["pred_joints"], points["gt_joints"]
+    for name, value in points.items():
+        _expect(name, value.shape, (len(gt), NUM_JOINTS, 3))
+    relative = subtract_wrist(pred, pred), subtract_wrist(gt, gt)
+    scores: dict[str, float] = {}
+    for prefix, pair in {"": (pred, gt), "rr_": relative, "pa_": (align(pred, gt), gt)}.items():
+        scores |= _set_scores(*pair, rules, prefix, "mpjpe_mm", "j")
+    return scores
+
+
 def point_distances(
     pred: Float[np.ndarray, "sample point 3"], gt: Float[np.ndarray, "sample point 3"]
 ) -> Float[np.ndarray, "sample point"]:

@@ -5,7 +5,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from poem_jax.data.view_sampling import AllViews, FixedViews, ReleaseNormalViews, UniformViews
+from poem_jax.data.view_sampling import (
+    AllViews,
+    FixedViews,
+    ReleaseNormalViews,
+    UniformViews,
+    cameras_in_words,
+    cameras_named,
+)
 
 RANDOM = [UniformViews(), UniformViews(2, 5), ReleaseNormalViews(1, 8), ReleaseNormalViews(2, 3)]
 
@@ -88,3 +95,27 @@ def test_fixed_rules_keep_the_frames_order():
 def test_ranges_without_views_are_refused(rule, bounds):
     with pytest.raises(ValueError, match=f"got {bounds[0]} to {bounds[1]}"):
         rule(*bounds)
+
+
+@pytest.mark.parametrize(
+    ("text", "counts", "words"),
+    [
+        ("all", {6}, "all"),
+        ("4", {4}, "the first 4"),
+        ("random", {6}, "all, in random order"),
+        ("random:4", {4}, "4 at random"),
+        ("random:2-5", {2, 3, 4, 5}, "2 to 5 at random"),
+    ],
+)
+def test_rules_have_names_and_words(text, counts, words):
+    rule = cameras_named(text)
+    drawn = draws(rule, 6, 200)
+    assert {len(views) for views in drawn} == counts
+    assert (len({tuple(views) for views in drawn}) > 1) == text.startswith("random")
+    assert cameras_in_words(rule) == words
+
+
+@pytest.mark.parametrize("text", ["", "two", "random:", "2-8", "random:2-", "-1"])
+def test_a_name_that_is_no_rule_is_refused(text):
+    with pytest.raises(ValueError, match="cameras are `all`"):
+        cameras_named(text)

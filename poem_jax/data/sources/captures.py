@@ -68,6 +68,7 @@ class Captures:
         labels: Sequence[str | Path] | None = None,
         mano: str | Path | None = None,
         max_reprojection_px: float | None = None,
+        joints_alone: bool = False,
     ) -> None:
         """Open captures and list their samples.
 
@@ -77,6 +78,8 @@ class Captures:
             mano: MANO_RIGHT.pkl or MANO_LEFT.pkl, for labels that hold pose and shape but no vertices.
             max_reprojection_px: Leave out views in which a fit lies farther than this, on average, from the
                 key points it was made of (`reprojection_px` of its file); None = keep them.
+            joints_alone: Take labels that are joints and nothing else, whose vertices are NaN: enough to
+                evaluate a model.
 
         Raises:
             FileNotFoundError: A folder, its rig, its images or its labels are missing.
@@ -89,7 +92,7 @@ class Captures:
         files = [None] * len(folders) if labels is None else [Path(file) for file in labels]
         names = _names([Path(folder) for folder in folders])
         self._captures = [
-            _open(name, Path(folder), file, mano)
+            _open(name, Path(folder), file, mano, joints_alone)
             for name, folder, file in zip(names, folders, files, strict=True)
         ]
         self._places: list[_Place] = []
@@ -143,7 +146,8 @@ class Captures:
             dist=rig.dist[views] if rig.dist[views].any() else None,
         )
         is_left = labels.sides[place.hand] == "left"
-        return check_frame(as_right_hand(frame) if is_left else frame, labels.path)
+        frame = as_right_hand(frame) if is_left else frame
+        return check_frame(frame, labels.path, joints_alone=labels.joints_alone)
 
     def fingerprint(self) -> Mapping[str, str]:
         """Return rig and labels of each capture, and the list of samples."""
@@ -155,10 +159,13 @@ class Captures:
         return files | {"samples": identify_list(keys)}
 
 
-def _open(name: str, folder: Path, labels_file: Path | None, mano: str | Path | None) -> _Capture:
+def _open(
+    name: str, folder: Path, labels_file: Path | None, mano: str | Path | None, joints_alone: bool
+) -> _Capture:
     rig = find_rig(folder)
     images = {frame_key(frame.name): frame for frame in find_frames(folder, rig.names)}
-    labels = read_labels(find_labels(folder) if labels_file is None else labels_file, mano=mano)
+    labels_file = find_labels(folder) if labels_file is None else labels_file
+    labels = read_labels(labels_file, mano=mano, joints_alone=joints_alone)
     if labels.cameras is not None and not set(labels.cameras) & set(rig.names):
         raise ValueError(
             f"{labels.path} is of the cameras {', '.join(labels.cameras)}, and the rig of {folder} has "

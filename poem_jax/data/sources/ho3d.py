@@ -76,6 +76,7 @@ class HO3D:
         version: str = "v3",
         mano: str | Path,
         held_out: str | Path | None = None,
+        sequences: tuple[str, ...] | None = None,
         strict_counts: bool = False,
     ) -> None:
         """List the split from the set's own lists.
@@ -86,6 +87,7 @@ class HO3D:
             version: "v2" or "v3".
             mano: The user's `MANO_RIGHT.pkl`.
             held_out: Folder of the labels of evaluation images; None looks within and beside the set.
+            sequences: Main sequences of the evaluation set (`("SM1",)`) that are listed; None = all.
             strict_counts: Insist on the paper's number of frames.
 
         Raises:
@@ -100,6 +102,8 @@ class HO3D:
         self.name = f"ho3d {version} {split}"
         self.max_views = 1 if split == "evaluation" else len(VIEW_ORDER)
         self._version, self._split = version, split
+        self.num_images = 0
+        """Lines of the list of the official evaluation set, whichever sequences are asked for."""
         self._mano = ManoFile.open(mano)
         lists = _LISTS.get(split, ("evaluation",))
         self._lists = [need_file(self.root / f"{n}.txt", "a list of samples", advice=ADVICE) for n in lists]
@@ -113,10 +117,13 @@ class HO3D:
             check_count(self.name, len(self), PAPER_COUNTS.get((version, split)), strict=strict_counts)
         else:
             self._held_out = HeldOutLabels.find(self.root, version, held_out, need="official")
+            self.num_images = len(members)
+            if sequences is not None:
+                members = [member for member in members if member.main in sequences]
             self._frames = [(m,) for m in members] if split == "evaluation" else group_views(members)
             check_count(
                 f"{self.name}: its list",
-                len(members),
+                self.num_images,
                 EVALUATION_COUNTS[version],
                 strict=strict_counts,
                 counted_by="the set's own count is",
@@ -125,6 +132,11 @@ class HO3D:
 
     def __len__(self) -> int:
         return len(self._frames)
+
+    def rows(self, index: int) -> tuple[int, ...]:
+        """Return of each view of a frame which line of its list it is: for the evaluation set, the place of
+        its hand in a submission."""
+        return tuple(member.row for member in self._frames[index])
 
     def __getitem__(self, index: int) -> MultiViewFrame:
         """Read one frame.

@@ -24,9 +24,10 @@ from poem_jax.mixture.config import (
     ReleasedTarsSource,
     SyntheticSource,
 )
+from poem_jax.tables.places import Places
 
-TARS, RAW = "data/dataset_tars", "data/raw"
-MANO = "data/mano/MANO_RIGHT.pkl"
+_PLACES = Places()
+TARS, RAW, MANO = str(_PLACES.tars), str(_PLACES.raw), str(_PLACES.mano)
 PROCESSES = 8
 
 

@@ -124,6 +124,26 @@ def test_labels_of_mano_alone_give_the_same_hands(tmp_path):
         assert np.allclose(ours.joints_cam, theirs.joints_cam, atol=1e-6)
 
 
+def test_joints_alone_are_labels_for_those_who_ask_for_them(tmp_path):
+    labels = write_capture(tmp_path / "desk", vertices_world=None, pose=None)
+    with pytest.raises(ValueError, match="must hold joints_world and vertices_world"):
+        Captures(tmp_path / "desk")
+    source = Captures(tmp_path / "desk", joints_alone=True)
+    for index, frame in enumerate(map(source.__getitem__, range(len(source)))):
+        T_world_from_cam = invert_rigid(frame.T_cam_from_world[0])
+        world = transform_points(T_world_from_cam, frame.joints_cam[0].astype(np.float64))
+        if frame.mirror_px is None:
+            assert np.allclose(world, labels["joints_world"][index // 2, index % 2], atol=1e-6)
+        assert np.isnan(frame.vertices_cam).all()
+        with pytest.raises(CorruptSampleError, match="`vertices_cam` is not finite"):
+            check_frame(frame, "x")
+
+
+def test_joints_alone_are_not_taken_where_there_is_a_mesh(tmp_path):
+    write_capture(tmp_path / "desk")
+    assert np.isfinite(Captures(tmp_path / "desk", joints_alone=True)[0].vertices_cam).all()
+
+
 def test_what_no_camera_shows_is_left_out(tmp_path):
     _, joints, _ = hands()
     rig = small_rig()

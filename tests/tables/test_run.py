@@ -1,0 +1,265 @@
+"""Tables from end to end on miniatures; one row of each recomputed with NumPy from what the model finds."""
+
+import json
+import zipfile
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from poem_jax.data.augmentation import augment
+from poem_jax.data.augmentation_recipes import NONE
+from poem_jax.data.sources.ho3d import HO3D
+from poem_jax.data.sources.released_tars import ReleasedTars
+from poem_jax.hand.model import HandModel
+from poem_jax.hand.topology import OPENPOSE_FROM_MANO, ROOT_JOINT, TIP_VERTICES_REGRESSED
+from poem_jax.models.apply import apply
+from poem_jax.tables.all_tables import TABLES, table_named
+from poem_jax.tables.places import Places
+from poem_jax.tables.result import Line, RunSettings, TableResult
+from poem_jax.tables.row import Checkpoint, Quoted, Shipped
+from poem_jax.tables.table import Table
+from poem_jax.weights.store import load
+from tests.tables.conftest import write_small
+from tests.tables.numpy_errors import aligned, area, error_mm
+
+QUIET = RunSettings(batch_size=1, progress=False)
+
+
+_apply = jax.jit(apply, static_argnames="config")
+"""Compiled like the system's own, so that the tests' cache of programs serves both."""
+
+
+def run(name: str, places: Places, settings: RunSettings = QUIET) -> TableResult:
+    return table_named(name).run(places, settings)
+
+
+def line_of(result: TableResult, group: str, label: str) -> Line:
+    (line,) = [line for line in result.lines if (line.group, line.label) == (group, label)]
+    return line
+
+
+def found_by(folder, frame, views, root_world=None):
+    """What a checkpoint finds in views of a frame: joints, vertices (first view's frame), and its hand."""
+    config, params = load(folder)
+    sample = augment(frame, np.array(views), NONE, config.image_hw, np.random.default_rng(0))
+    root = np.full(3, np.nan) if root_world is None else root_world
+    given = {"root_world": np.asarray(root, np.float32)[None]} if config.takes_root else {}
+    cameras = type(sample.cameras)(*(leaf[None] for leaf in sample.cameras))
+    pred = _apply(params, sample.views[None], cameras, config=config, **given)
+    hand = HandModel(**jax.device_get(params["constants"]["hand"]))
+    return np.asarray(pred.joints_world[0], float), np.asarray(pred.vertices_world[0], float), hand
+
+
+def regressed(hand: HandModel, vertices: np.ndarray) -> np.ndarray:
+    """Joints of a mesh: MANO's order and the tips, then OpenPose's order."""
+    both = np.concatenate([hand.J_regressor.astype(float) @ vertices, vertices[list(TIP_VERTICES_REGRESSED)]])
+    return both[list(OPENPOSE_FROM_MANO)]
+
+
+def check_as_poem(line: Line, folder, frame, views) -> None:
+    """Compare a row of the protocol `poem-release` of one frame with NumPy."""
+    joints, vertices, hand = found_by(folder, frame, views)
+    first = views[0]
+    truth, true_joints = frame.vertices_cam[first].astype(float), frame.joints_cam[first].astype(float)
+    ours, theirs = regressed(hand, vertices), regressed(hand, truth)
+    expected = {
+        "mpvpe_mm": error_mm(vertices, truth),
+        "rr_mpvpe_mm": error_mm(vertices - ours[0], truth - theirs[0]),
+        "pa_mpvpe_mm": error_mm(aligned(vertices, truth), truth),
+        "auc_v_20": area(vertices, truth, 20, 20),
+        "mpjpe_mm": error_mm(ours, theirs),
+        "rr_mpjpe_mm": error_mm(ours - ours[0], theirs - theirs[0]),
+        "pa_mpjpe_mm": error_mm(aligned(ours, theirs), theirs),
+        "auc_j_20": area(joints, true_joints, 20, 20),
+        "auc_v_50": area(vertices, truth, 50, 20),
+        "auc_j_50": area(joints, true_joints, 50, 20),
+    }
+    assert line.ours is not None
+    assert line.samples == 1
+    for name in line.columns:
+        # Areas count points below thresholds, of which one may lie at a threshold to float32.
+        tolerance = {"abs": 0.003} if "auc" in name else {"rel": 1e-4}
+        assert line.ours[name] == pytest.approx(expected[name], **tolerance), name
+
+
+@pytest.mark.slow
+def test_v2_runs_on_all_five_sets(all_places) -> None:
+    result = run("v2", all_places)
+    absent = [line for line in result.lines if line.ours is None]
+    assert {line.label.split(" (")[0] for line in absent} == {"POEM v2-param"}
+    assert len(result.lines) - len(absent) == 20
+    frame = ReleasedTars(all_places.tars / "Arctic_mv", split="val")[0]
+    views = np.random.default_rng((QUIET.seed, 0)).permutation(8)
+    line = line_of(result, "ARCTIC-Mv", "POEM v2-large (8 cameras)")
+    check_as_poem(line, all_places.checkpoints / "v2-large", frame, views)
+
+
+def test_row_9_of_v2_is_numpys(places) -> None:
+    result = replace_rows(table_named("v2"), "OakInk-Mv").run(places, QUIET)
+    absent = [line for line in result.lines if line.ours is None]
+    assert [line.label for line in absent] == ["POEM v2-param (4 cameras)"]
+    assert "import-torch medium_MANO.pth.tar" in absent[0].absent[0]
+    assert str(places.checkpoints / "v2-param") in absent[0].absent[0]
+    line = line_of(result, "OakInk-Mv", "POEM v2 (4 cameras)")
+    frame = ReleasedTars(places.tars / "Oakink_mv", split="test")[0]
+    views = np.random.default_rng((QUIET.seed, 0)).permutation(4)
+    check_as_poem(line, places.checkpoints / "v2-base", frame, views)
+    assert line.what["protocol"] == "poem-release"
+    assert "1 of 46 shards" in line.what["data"]
+
+
+def test_ho3d_v3_counts_images_and_writes_the_submission(places, tmp_path) -> None:
+    result = run("ho3d-v3", places, QUIET._replace(out=str(tmp_path)))
+    quoted = next(line for line in result.lines if line.label == "Hamba")
+    assert quoted.paper["pa_f_5"] == 0.681
+    assert quoted.absent == ()
+    line = line_of(result, "HO-3D v3, official", "POEM v2-large")
+    source = HO3D(places.raw / "HO3D", split="evaluation-mv", version="v3", mano=places.mano)
+    assert line.samples == source.num_images
+    with zipfile.ZipFile(result.files[0]) as archive:
+        joints, vertices = (np.array(part) for part in json.loads(archive.read("pred.json")))
+    # The official evaluation, with the labels as its authors give them out.
+    given = places.raw / "HO3D" / "HO3D_v3"
+    true_joints, truth = (
+        np.array(json.loads((given / f"evaluation_{name}.json").read_text())) for name in ("xyz", "verts")
+    )
+    assert joints.shape == true_joints.shape
+    pairs = [*zip(vertices, truth, strict=True)]
+    expected = {
+        "pa_mpvpe_mm": np.mean([error_mm(aligned(*pair), pair[1]) for pair in pairs]),
+        "pa_mpjpe_mm": np.mean([error_mm(aligned(*p), p[1]) for p in zip(joints, true_joints, strict=True)]),
+        "pa_auc_v_50": np.mean([area(aligned(*pair), pair[1], 50, 100) for pair in pairs]),
+    }
+    for name, value in expected.items():
+        assert line.ours[name] == pytest.approx(value, rel=2e-3), name
+
+
+def test_ho3d_submission_is_not_written_of_a_part(places, tmp_path) -> None:
+    result = run("ho3d-v3", places, QUIET._replace(out=str(tmp_path), samples=1))
+    assert result.files == ()
+    assert "no submission is written" in result.lines[-1].notes[-1]
+
+
+@pytest.mark.slow
+def test_single_view_gets_the_true_root(all_places) -> None:
+    line = run("single-view", all_places).lines[0]
+    source = HO3D(
+        all_places.raw / "HO3D", split="evaluation-mv", version="v2", mano=all_places.mano, sequences=("SM1",)
+    )
+    frame = source[0]
+    truth, true_joints = frame.vertices_cam[0], frame.joints_cam[0]
+    joints, vertices, _ = found_by(all_places.checkpoints / "v2-base", frame, [0], true_joints[ROOT_JOINT])
+    assert line.ours["pa_mpvpe_mm"] == pytest.approx(error_mm(aligned(vertices, truth), truth), rel=1e-4)
+    assert line.ours["pa_mpjpe_mm"] == pytest.approx(
+        error_mm(aligned(joints, true_joints), true_joints), rel=1e-4
+    )
+    assert line.ours["mpvpe_mm"] == pytest.approx(error_mm(vertices, truth), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", list(TABLES))
+def test_without_data_and_weights_every_row_says_what_to_download(name, tmp_path) -> None:
+    table = table_named(name)
+    assert isinstance(table, Table)
+    nowhere = Places(tmp_path / "data", tmp_path / "weights")
+    result = table.run(nowhere, QUIET)
+    assert len(result.lines) == len(table.rows)
+    for row, line in zip(table.rows, result.lines, strict=True):
+        assert line.ours is None
+        if isinstance(row.system, Quoted):
+            assert not line.absent
+            continue
+        text = "\n".join(line.absent)
+        assert str(nowhere.data) in text
+        assert row.data.title in text
+        if isinstance(row.system, Checkpoint):
+            assert str(nowhere.checkpoints / row.system.name) in text
+            assert "poem train" in text
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_checkpoint_of_another_system_is_not_scored(places, tmp_path) -> None:
+    elsewhere = replace(places, checkpoints=tmp_path)
+    (tmp_path / "v1-oakink").symlink_to(places.checkpoints / "v2-base")
+    line = line_of(run("robustness", elsewhere), "OakInk-Mv", "POEM v1")
+    assert line.ours is None
+    assert "holds a Config; expected a PoemV1Config" in line.absent[0]
+
+
+def test_damaged_data_cost_their_rows_alone(places, tmp_path) -> None:
+    damaged = replace(places, data=tmp_path)
+    folder = tmp_path / "dataset_tars" / "Oakink_mv"
+    folder.mkdir(parents=True)
+    (folder / "Oakink_mv_test-000000.tar").write_bytes(b"no tar" * 200)
+    result = run("v2", damaged)
+    broken = line_of(result, "OakInk-Mv", "POEM v2 (4 cameras)")
+    assert "Oakink_mv_test-000000.tar" in broken.absent[0]
+    assert "download" in line_of(result, "HO3D-Mv", "POEM v2 (5 cameras)").absent[0]
+
+
+@pytest.mark.slow
+def test_ho3d_v2_has_a_calibration_beside_it(all_places, tmp_path) -> None:
+    line = run("ho3d-v2", all_places, QUIET._replace(out=str(tmp_path))).lines[-1]
+    assert line.samples == 13
+    assert (tmp_path / "ho3d-v2_submission.zip").is_file()
+
+
+@pytest.mark.slow
+def test_main_and_ablation_run_and_one_row_each_is_numpys(places) -> None:
+    only = [replace_rows(table_named(name), "OakInk-Mv") for name in ("main", "ablation")]
+    absent = {"v1-g-emb-oakink", "v1-gv-emb-oakink"}
+    for row in (row for table in only for row in table.rows):
+        if row.system.name not in absent:
+            write_small(places, row.system.name, row.system.preset)
+    results = [table.run(places, QUIET) for table in only]
+    for table, result in zip(only, results, strict=True):
+        for row, line in zip(table.rows, result.lines, strict=True):
+            assert (line.ours is None) == (row.system.name in absent), line.absent
+    frame = ReleasedTars(places.tars / "Oakink_mv", split="test")[0]
+    for result, label, model in zip(
+        results, ("PE-MeshTR", "w/o-proj"), ("pe-meshtr", "v1-wo-proj"), strict=True
+    ):
+        line = line_of(result, "OakInk-Mv", label)
+        check_as_poem(line, places.checkpoints / f"{model}-oakink", frame, range(4))
+
+
+def replace_rows(table: Table, group: str) -> Table:
+    return replace(table, rows=tuple(row for row in table.rows if row.data.title == group))
+
+
+@pytest.mark.slow
+def test_robustness_tells_what_shuffled_and_foreign_cameras_cost(all_places) -> None:
+    for dataset in ("dexycb", "oakink", "ho3d"):
+        write_small(all_places, f"v1-{dataset}", "v1")
+    result = run("robustness", all_places)
+    assert all(line.ours is not None for line in result.lines)
+    frame = ReleasedTars(all_places.tars / "HO3D_mv_test", split="test")[0]
+    line = line_of(result, "HO3D-Mv", "trained on OakInk")
+    check_as_poem(line, all_places.checkpoints / "v1-oakink", frame, range(5))
+    shuffled = line_of(result, "DexYCB-Mv", "cameras shuffled")
+    assert shuffled.ours["mpvpe_mm"] != line_of(result, "DexYCB-Mv", "POEM v1").ours["mpvpe_mm"]
+
+
+@pytest.mark.slow
+def test_real_world_compares_a_fit_to_key_points_with_networks(all_places) -> None:
+    source = table_named("real-world").rows[0].data.open(all_places).source
+    frames = [source[i] for i in range(len(source))]
+    file = all_places.data / "keypoints" / "real_world.npz"
+    file.parent.mkdir()
+    keys, points = [frame.key for frame in frames], [frame.keypoints_px for frame in frames]
+    np.savez(file, keys=np.array(keys), keypoints_px=np.array(points))
+    table = table_named("real-world")
+    without_shipped = replace(table, rows=tuple(r for r in table.rows if not isinstance(r.system, Shipped)))
+    adam, fit, base = without_shipped.run(all_places, QUIET).lines
+    for line in (adam, fit, base):
+        assert line.samples == 2
+    for line in (adam, fit):
+        assert str(file) in line.what["system"]
+        # True key points of a hand of the solver's own model.
+        assert line.ours["mpvpe_mm"] < 5 < base.ours["mpvpe_mm"]
+    errors = []
+    for frame in frames:
+        _, vertices, _ = found_by(all_places.checkpoints / "v2-base", frame, range(len(frame.images)))
+        errors.append(error_mm(vertices, frame.vertices_cam[0]))
+    assert base.ours["mpvpe_mm"] == pytest.approx(np.mean(errors), rel=1e-4)
