@@ -73,7 +73,7 @@ class StandIn(nnx.Module):
         self.norm_mean = nnx.BatchStat(jnp.zeros(3))
         self.template = Constant(jnp.asarray(template_queries(hand, config.query_order)))
 
-    def look(self, views: Array, mode: NormMode) -> Seen:
+    def look(self, views: Array, mode: NormMode, settled: NormMode | None = None) -> Seen:
         """Average over the pixels, as sums of whole numbers: exact, in whatever order."""
         scale = 1.0 if views.dtype == jnp.uint8 else 255.0
         grey_levels = jnp.round(jnp.asarray(views, self.template[...].dtype) * scale)

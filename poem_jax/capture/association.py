@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from poem_jax.calibration.view_agreement import UNEXPLAINED
 from poem_jax.capture import association_words as words
 from poem_jax.capture.calibration_check import check_calibration
 from poem_jax.capture.detections import within_images
@@ -172,7 +173,10 @@ def _of_one_camera(
 def _why_none_agree(detections: Sequence[Sequence[Sequence[DetectedHand]]], rig: Rig) -> str:
     """Say that nothing meets, and what is wrong with the rig if its hands by side tell."""
     seen = within_images(hands_by_side(detections, rig.num_views).keypoints_px, rig)
-    found = sorted(check_calibration(rig, seen), key=lambda finding: not finding.fatal)
-    why = str(found[0]) if found else "check the rig, that frames are synchronous and views in its order"
+    met = np.isfinite(seen).all(-1).any(-1).sum(-1) > 1
+    found = [finding for finding in check_calibration(rig, seen) if finding.name not in UNEXPLAINED]
+    why = "check the rig, that frames are synchronous and views in its order"
+    if met.any() and found:
+        why = str(min(found, key=lambda finding: not finding.fatal))
     cameras = ", ".join(rig.names)
     return f"no two of the cameras {cameras} agree on a hand in any frame, though hands were found: {why}"

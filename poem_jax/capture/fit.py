@@ -85,7 +85,8 @@ def fit_hands(
         moments, findings = known_times(group), []
         if not said:
             findings = judge_views(take.rig, raw, time_s=moments)
-            if not findings and not timed and moments is not None and len(group) >= _FRAMES_FOR_OFFSETS:
+            seen = np.isfinite(raw).all(-1).any((1, 2, 3)).sum()
+            if not findings and not timed and moments is not None and seen >= _FRAMES_FOR_OFFSETS:
                 findings, timed = judge_time(take.rig, raw, moments), True
         warnings = [str(finding) for finding in findings]
         said = said or bool(warnings)

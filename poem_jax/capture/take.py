@@ -184,6 +184,11 @@ def _moments_of(
     Raises: ValueError: The offsets that are asked for are others; or as `find_moments`.
     """
     if hands.offsets_s is None:
+        if any(timing.offsets_s.values()):
+            _log.warning(
+                "%s does not say under which offsets its hands were found: they are taken to be those given",
+                path,
+            )
         return find_moments(folder, rig, timing)
     asked = {
         **read_sync(folder, rig.names).offsets_s,

@@ -4,6 +4,7 @@ Only warnings, errors and the end by a signal carry the prefix `poem:`.
 """
 
 import contextlib
+import errno
 import logging
 import shlex
 import sys
@@ -14,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from poem_jax.capture.write import Written
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What the system says where no more can be written."""
 
 
 def say(text: str) -> None:
@@ -54,13 +58,13 @@ class _Formatter(logging.Formatter):
 
 @contextlib.contextmanager
 def tells_what_is_left(out: Path) -> Iterator[None]:
-    """When the block is stopped, or a file cannot be written, say whether anything is in `out` so far."""
+    """When the block is stopped, or the disk is full, say whether anything is in `out` so far."""
     start = time.time()
     try:
         yield
     except (KeyboardInterrupt, OSError) as stop:
-        written = _written_since(out, start)
-        if written or isinstance(stop, KeyboardInterrupt):
+        written, full = _written_since(out, start), isinstance(stop, OSError) and stop.errno in DISK_FULL
+        if isinstance(stop, KeyboardInterrupt) or (written and full):
             say(f"what was done so far is in {out}" if written else f"nothing was written to {out}")
         raise
 

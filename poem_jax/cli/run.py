@@ -1,6 +1,5 @@
 """From arguments to an exit code: one command is read, run, and ends in one line whatever happens."""
 
-import errno
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +16,7 @@ from poem_jax.cli.fit import Fit
 from poem_jax.cli.import_torch import ImportTorch
 from poem_jax.cli.inspect import Inspect
 from poem_jax.cli.live import Live
-from poem_jax.cli.messages import set_up_logging
+from poem_jax.cli.messages import DISK_FULL, set_up_logging
 from poem_jax.cli.pack import Pack
 from poem_jax.cli.reconstruct import Reconstruct
 from poem_jax.cli.retarget import Retarget
@@ -92,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _told(error: Exception) -> str:
     """Return an error's text, in our words where the disk is full."""
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
         where = f" at {error.filename}" if error.filename else ""
         return f"the disk is full{where}: make room, or give another folder"
     return str(error)

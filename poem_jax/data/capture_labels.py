@@ -139,6 +139,10 @@ def read_labels(
     if "valid" in arrays:
         valid = _shaped(arrays["valid"], "valid", (count, len(sides)), path).astype(bool)
         joints = np.where(valid[..., None, None], joints, np.nan)
+    if "bridged" in arrays:
+        # Put between the moments before and after, not seen.
+        bridged = _shaped(arrays["bridged"], "bridged", (count, len(sides)), path).astype(bool)
+        joints = np.where(bridged[..., None, None], np.nan, joints)
     return CaptureLabels(
         path,
         sides,

@@ -1,7 +1,7 @@
 """What may happen to the cameras between training and use: another order, fewer, others, or badly calibrated.
 
 Pure functions of a batch and a key; views go with their cameras and key points, and the hand in the world
-stays where it is. Valid views come first in what they return, whatever order they were in.
+stays where it is.
 """
 
 import jax
@@ -44,8 +44,13 @@ def replace_cameras(
     has too few, fewer are exchanged. The rest is masked.
 
     Raises:
-        ValueError: `num_replaced` is more than `num_views`, or not a count.
+        ValueError: `num_views` leaves no view to exchange with, or `num_replaced` is more than `num_views`.
     """
+    if not 1 <= num_views < batch.views.shape[1]:
+        raise ValueError(
+            f"`num_views` must be from 1 to {batch.views.shape[1] - 1}, so that some are left to exchange "
+            f"with; got {num_views}"
+        )
     if not 0 <= num_replaced <= num_views:
         raise ValueError(f"`num_replaced` must be 0 to `num_views` = {num_views}; got {num_replaced}")
     mask = jnp.asarray(batch.cameras.view_mask)
@@ -55,7 +60,7 @@ def replace_cameras(
     spare = jnp.argsort(rest, axis=1) + num_views
     spares = jnp.sum(mask[:, num_views:], axis=1, keepdims=True)
     goes = (first < jnp.minimum(num_replaced, spares)) & mask[:, :num_views]
-    chosen = jnp.take_along_axis(spare, jnp.minimum(first, spare.shape[1] - 1), axis=1) if spare.size else 0
+    chosen = jnp.take_along_axis(spare, jnp.minimum(first, spare.shape[1] - 1), axis=1)
     order = jnp.where(goes, chosen, place[:num_views])
     return _take(batch, order)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from poem_jax.data.capture_folder import RIG_FILES, find_rig_file
+from poem_jax.data.capture_labels import LABEL_FILES
 from poem_jax.data.shards import is_hidden
 from poem_jax.mixture.config import (
     ArcticSource,
@@ -133,13 +134,15 @@ def _is(kind: Kind, folder: Path) -> bool:
 
 
 def _holds_calibration(folder: Path) -> bool:
-    """Tell whether another tool's calibration lies there; raw sets hold some too."""
+    """Tell whether frames and another tool's calibration lie there; raw sets hold such files too."""
+    if not (folder / "frames").is_dir() and not any((folder / name).is_file() for name in LABEL_FILES):
+        return False
     try:
         find_rig_file(folder)
     except FileNotFoundError:
         return False
-    except ValueError:  # Several: opening the capture says so.
-        return True
+    except ValueError:
+        pass  # Several: opening the capture says so.
     return True
 
 

@@ -17,7 +17,7 @@ class StandingCamera:
     place_m: tuple[float, float, float]
     looks_at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roll_deg: float = 0.0
-    """About its axis, clockwise as it sees the world; 0 = upright."""
+    """About its axis; 0 = upright, and so many degrees turn the picture clockwise."""
     field_of_view_deg: float = 60.0
     """Of the frame's longer side."""
     frame_wh: tuple[int, int] = (640, 480)

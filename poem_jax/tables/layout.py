@@ -129,7 +129,8 @@ def _markdown_rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[s
 
 
 def _how(lines: Sequence[Line]) -> list[str]:
-    scored = [line for line in lines if line.ours is not None]
+    # One that ran and found no hand has no number, and its notes say so.
+    scored = [line for line in lines if line.samples is not None]
     if not scored:
         return []
     names = list(dict.fromkeys(name for line in scored for name in line.what))

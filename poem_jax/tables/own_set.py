@@ -12,8 +12,8 @@ from poem_jax.tables.row import AT_20_MM, AT_50_MM, OFFICIAL
 from poem_jax.tables.run import notes_of
 from poem_jax.weights.store import SHIPPED, load
 
-COLUMNS = (*dict.fromkeys((*AT_20_MM, *AT_50_MM, "f_5", "f_15", *OFFICIAL)),)
-"""Of all protocols; a column that one lacks is left out."""
+_COLUMNS = (*dict.fromkeys((*AT_20_MM, *AT_50_MM, "f_5", "f_15")),)
+"""A column that the protocol lacks is left out."""
 _VALIDATION = {Kind.ARCTIC: "val", Kind.INTERHAND: "val"}
 """Splits that stand for a test; the other sets have one."""
 
@@ -56,10 +56,12 @@ def score_path(source: FrameSource, checkpoint: Path | None, settings: SetSettin
     """
     weights = SHIPPED if checkpoint is None else checkpoint
     scores = score_set(Network(*load(weights)), source, settings)
+    wanted = OFFICIAL if scores.protocol == "ho3d" else _COLUMNS
+    columns = tuple(name for name in wanted if name in scores.rows)
     line = Line(
         group=source.name,
         label=str(weights),
-        columns=tuple(name for name in COLUMNS if name in scores.rows),
+        columns=columns or _COLUMNS[:1],
         paper={},
         ours=scores.means if scores.keys else None,
         spread=scores.standard_errors if scores.keys else {},

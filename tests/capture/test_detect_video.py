@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from poem_jax.calibration.rig_json import write_rig
+from poem_jax.calibration.rig_json import read_rig, write_rig
 from poem_jax.capture import detect
 from poem_jax.capture.boxes_file import read_boxes
 from poem_jax.capture.detections import Detections, SearchFile
@@ -120,6 +120,25 @@ def test_a_rig_is_checked_by_hands_that_it_did_not_put_together(search, folder, 
         capsys.readouterr()
         assert main([*check, "--out", str(tmp_path / told)]) == 1
         assert told in capsys.readouterr().out
+
+
+def test_a_detector_that_mistakes_sides_is_not_the_rigs_fault(search, folder, tmp_path, monkeypatch):
+    search()
+
+    class Mistaken(Seen):
+        def __call__(self, views, images):
+            found = super().__call__(views, images)
+            return [
+                [hand._replace(side="left" if view == 1 else hand.side) for hand in hands]
+                for view, hands in zip(views, found, strict=True)
+            ]
+
+    rig = read_rig(folder / "rig.json")
+    mistaken = Mistaken(rig)
+    monkeypatch.setattr(detect, "_our_detector", lambda *_: mistaken)
+    check = ["calibration", "check", str(folder / "rig.json"), "--videos", str(folder)]
+    assert main([*check, "--out", str(tmp_path / "good")]) == 0
+    assert mistaken.images == 3 * FRAMES, "the images are searched once"
 
 
 def test_a_search_that_is_stopped_goes_on(search, tmp_path, capsys, caplog):

@@ -83,6 +83,9 @@ def test_patterns_and_files_of_tars_are_tars():
 def test_a_capture_may_have_the_calibration_of_another_tool(name, tmp_path):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     write_calibration(tmp_path / name, small_rig())
+    with pytest.raises(ValueError, match="none that is known"):
+        recognise(tmp_path)
+    (tmp_path / "frames").mkdir()
     assert recognise(tmp_path) is Kind.CAPTURE
 
 

@@ -76,7 +76,7 @@ def test_dropped_views_leave_so_many(batch, num_views):
     )
 
 
-@pytest.mark.parametrize(("num_views", "num_replaced"), [(4, 0), (4, 1), (3, 2), (4, 4), (6, 3)])
+@pytest.mark.parametrize(("num_views", "num_replaced"), [(4, 0), (4, 1), (3, 2), (4, 4), (5, 3)])
 def test_replaced_views_come_from_the_rest(batch, num_views, num_replaced):
     changed = replace_cameras(batch, num_views, num_replaced, key=KEY)
     check_views_keep_their_cameras(changed, batch)
@@ -111,5 +111,7 @@ def test_wrong_counts_are_refused(batch):
         drop_cameras(batch, 0, key=KEY)
     with pytest.raises(ValueError, match="`num_replaced` must be 0 to `num_views` = 3; got 4"):
         replace_cameras(batch, 3, 4, key=KEY)
+    with pytest.raises(ValueError, match=r"`num_views` must be from 1 to 5.*got 6"):
+        replace_cameras(batch, 6, 3, key=KEY)
     with pytest.raises(ValueError, match=r"must not be negative; got -1\.0 and 0\.0"):
         noisy_extrinsics(batch, -1.0, 0.0, key=KEY)

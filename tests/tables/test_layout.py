@@ -36,6 +36,7 @@ RESULT = TableResult(
         line("shuffled", (12, 8, 5, 3), (14.5, 5, 6, 4), against="base", num_views=2, series="s"),
         line("absent", (9, 4, 5, 3), absent=("put it there",)),
         line("absent too", (), absent=("put it there",), notes=("a note",)),
+        line("found nothing", samples=0, notes=("3 samples in no mean",)),
     ),
 )
 
@@ -54,6 +55,8 @@ def test_markdown_has_the_papers_number_beside_ours() -> None:
     assert rows["absent"][2] == "- (9.00)"
     assert rows["absent too"][2] == "-"
     assert text.count("put it there") == 1
+    assert "3 samples in no mean" in text
+    assert "a note" not in text
     assert "Set-Mv: absent, Set-Mv: absent too" in text
 
 
@@ -77,7 +80,7 @@ def test_degradation_is_the_increase() -> None:
 
 def test_a_picture_has_a_bar_as_long_as_its_number(tmp_path) -> None:
     image = draw_table(RESULT)
-    blue = (image == (30, 110, 190)).all(-1)[: 44 + 34 * 4]
+    blue = (image == (30, 110, 190)).all(-1)[: 44 + 34 * 5]
     bars = [int(row.sum()) for row in blue if row.sum() > 100]
     assert len(set(bars)) == 2
     assert max(bars) / min(bars) == pytest.approx(2, rel=0.01)

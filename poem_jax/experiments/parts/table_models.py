@@ -13,6 +13,7 @@ from poem_jax.models.config import (
     DecoderConfig,
     Design,
     ModelConfig,
+    ResNetConfig,
 )
 from poem_jax.models.detr_config import DetrConfig
 from poem_jax.models.frustum_config import Cuboid, DepthSteps, FrustumConfig
@@ -38,6 +39,8 @@ _CUBOID = Cuboid((-0.4, -0.4, 0.4), (0.4, 0.4, 1.4))
 """Where hands are before the first camera of any of the rigs."""
 _MEAN_ROOT = (0.0, 0.0, 0.92)
 """Before the first camera of the rig that is trained on."""
+_TRUNK = TINY.backbone
+assert isinstance(_TRUNK, ResNetConfig)
 _DETR = DetrConfig(num_layers=_LAYERS, num_heads=4, ffn_width=256, dropout=0.0)
 _FRUSTUM = FrustumConfig(8, _CUBOID.low[2], _CUBOID.high[2], DepthSteps.LINEAR)
 
@@ -45,7 +48,7 @@ _V2 = Config(
     image_hw=TINY.image_hw,
     crop=TINY.crop,
     width=_WIDTH,
-    backbone=TINY.backbone,
+    backbone=_TRUNK,
     root=TINY.root,
     basis=BasisConfig(num_points=_BASIS),
     decoder=DecoderConfig(num_layers=_LAYERS, num_neighbours=_NEIGHBOURS, ffn_expansion=2),
@@ -54,7 +57,7 @@ _V1 = PoemV1Config(
     image_hw=TINY.image_hw,
     crop=TINY.crop,
     width=_WIDTH,
-    backbone=TINY.backbone,
+    backbone=_TRUNK,
     first_stage=TINY.root,
     basis=BallConfig(_BASIS, frustum=_FRUSTUM),
     decoder=PointDecoderConfig(_LAYERS, _NEIGHBOURS, ffn_expansion=2),
@@ -64,7 +67,7 @@ _PE_MESHTR = MeshTransformerConfig(
     image_hw=TINY.image_hw,
     crop=TINY.crop,
     width=_WIDTH,
-    backbone=TINY.backbone,
+    backbone=_TRUNK,
     cuboid=_CUBOID,
     decoder=_DETR,
 )
@@ -85,7 +88,7 @@ TABLE_MODELS: dict[str, ModelConfig] = {
         image_hw=TINY.image_hw,
         crop=TINY.crop,
         width=_WIDTH,
-        backbone=TINY.backbone,
+        backbone=_TRUNK,
         cuboid=_CUBOID,
         decoder=MvpDecoderConfig(_LAYERS, num_heads=4, ffn_expansion=2, dropout=0.0),
     ),
