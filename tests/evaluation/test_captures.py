@@ -35,7 +35,8 @@ class Shifted:
     """Finds the true hand, some millimetres beside it; never the third one of a batch."""
 
     hand, image_hw, recipe = default_hand(), (16, 16), NONE
-    least_views, most_views, takes_root, one_at_a_time = 1, None, False, False
+    least_views, takes_root, one_at_a_time = 1, False, False
+    most_views: int | None = None
 
     def __init__(self, shift_mm=0.0):
         self.shift = np.array([shift_mm / 1000, 0, 0])

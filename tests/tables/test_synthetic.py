@@ -1,5 +1,6 @@
 """The synthetic table: what runs, what is said of the rest, and who is ranked."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.experiments.synthetic_table import configs
 from poem_jax.tables import synthetic
 from poem_jax.tables.all_tables import table_named
-from poem_jax.tables.layout import as_json, as_markdown
+from poem_jax.tables.layout import as_markdown, write_table
+from poem_jax.tables.picture import curves_of, write_picture
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings
 from poem_jax.tables.synthetic import FITTING, MEAN_ROTATED, NOT_FAR_ENOUGH, TRAINED, ranked
@@ -70,7 +72,17 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(result):
     assert one_seed.ours is not None
     assert len(one_seed.absent) == 1
     assert "mvp-0" in as_markdown(result)
-    assert as_json(result)["table"] == "synthetic"
+
+
+def test_it_is_written_and_drawn_like_the_papers(result, tmp_path):
+    paths = write_table(tmp_path, result)
+    assert {Path(path).name for path in paths} == {"synthetic.md", "synthetic.json"}
+    rows = json.loads((tmp_path / "synthetic.json").read_text())["rows"]
+    (row,) = [row for row in rows if (row["label"], row["data"]) == ("POEM v1", "corners, 4 cameras")]
+    assert row["how"]["paper's rank"] == "1 of 8"
+    assert [point.num_views for point in curves_of(result.lines)["POEM v1"]["ours"]] == [2, 4, 8]
+    write_picture(tmp_path / "synthetic.png", result)
+    assert (tmp_path / "synthetic.png").stat().st_size > 1000
 
 
 def test_a_system_worse_than_the_turned_mean_hand_has_no_rank(result):
