@@ -57,11 +57,14 @@ bench: setup
 accelerator: setup
 	$(BIN)/python -m tools.accelerator --minutes $(MINUTES)
 
-# Every system twice; what was stopped goes on where it was.
+# Every system twice; what was stopped goes on where it was, what is exported stays. Then the table of them.
 synthetic-table: setup
 	@for seed in 0 1; do for system in $(TABLE_SYSTEMS); do \
-	  nice -n 19 $(BIN)/poem train synthetic_table:$$system --train.seed $$seed \
-	    --train.out runs/synthetic_table_$$system-$$seed || exit 1; done; done
+	  model=checkpoints/synthetic_table/$$system-$$seed; [ -d $$model ] && continue; \
+	  run="nice -n 19 $(BIN)/poem train synthetic_table:$$system --train.seed $$seed \
+	    --train.out runs/synthetic_table_$$system-$$seed"; \
+	  $$run && $$run --export $$model || exit 1; done; done
+	nice -n 19 $(BIN)/python eval.py --table synthetic
 
 lock: setup
 	$(BIN)/pip-compile --quiet --strip-extras --no-emit-options --no-emit-index-url --no-emit-find-links --extra dev --extra train --output-file requirements.lock pyproject.toml

@@ -43,7 +43,7 @@ class Eval:
     """An experiment of the package, such as tiny_synthetic, or a Python file that defines `config`; it names
     the model and the distribution of captures."""
     table: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """main, ablation, robustness, v2, ho3d-v2, ho3d-v3, single-view or real-world."""
+    """main, ablation, robustness, v2, ho3d-v2, ho3d-v3, single-view, real-world or synthetic."""
     dataset: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
     """Tars, the folder of a raw set, or a labelled capture; with --table real-world, its capture."""
     checkpoint: OptionalFolder = None

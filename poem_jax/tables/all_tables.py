@@ -1,6 +1,6 @@
 """Every table by the name under which `poem eval --table` knows it."""
 
-from poem_jax.tables import ablation, ho3d_official, main, real_world, robustness, single_view, v2
+from poem_jax.tables import ablation, ho3d_official, main, real_world, robustness, single_view, synthetic, v2
 from poem_jax.tables.result import AnyTable
 
 TABLES: dict[str, AnyTable] = {
@@ -14,6 +14,7 @@ TABLES: dict[str, AnyTable] = {
         ho3d_official.version_3,
         single_view.table,
         real_world.table,
+        synthetic.table,
     )
 }
 

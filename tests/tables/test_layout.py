@@ -98,8 +98,9 @@ def test_curves_are_of_series_with_two_numbers_of_views() -> None:
 
 
 def test_every_row_of_the_paper_can_be_laid_out() -> None:
-    for table in TABLES.values():
-        assert isinstance(table, Table)
+    of_rows = [table for table in TABLES.values() if isinstance(table, Table)]
+    assert len(of_rows) == len(TABLES) - 1  # the synthetic one, which the paper has not
+    for table in of_rows:
         for row in table.rows:
             assert set(row.columns) <= set(COLUMNS)
         labels = [(row.data.title, row.label) for row in table.rows]

@@ -1,0 +1,135 @@
+"""The synthetic table: what runs, what is said of the rest, and who is ranked."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from poem_jax.experiments.synthetic_benchmark import benchmark
+from poem_jax.experiments.synthetic_table import configs
+from poem_jax.tables import synthetic
+from poem_jax.tables.all_tables import table_named
+from poem_jax.tables.layout import as_markdown, write_table
+from poem_jax.tables.picture import curves_of, write_picture
+from poem_jax.tables.places import Places
+from poem_jax.tables.result import Line, RunSettings
+from poem_jax.tables.synthetic import FITTING, MEAN_ROTATED, NOT_FAR_ENOUGH, TRAINED, ranked
+from tests.evaluation.test_captures import SMALL, Shifted
+
+MAKEFILE = Path(__file__).resolve().parents[2] / "Makefile"
+SHIFTS = {"v1-0": 4.0, "v1-1": 6.0, "mvp-1": 300.0}
+"""Millimetres by which the stand-ins of two trained systems are wrong."""
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    places = Places(*(tmp_path_factory.mktemp(name) for name in ("data", "checkpoints")))
+    for name in SHIFTS:
+        (places.checkpoints / synthetic.FOLDER / name).mkdir(parents=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "CAPTURES", SMALL)
+        patch.setattr(synthetic, "load", lambda folder: (None, Path(folder)))
+        patch.setattr(synthetic, "Network", lambda config, folder: Shifted(SHIFTS[folder.name]))
+        patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: Shifted(1.0))
+        return table_named("synthetic").run(places, RunSettings(samples=3, batch_size=3, progress=False))
+
+
+def line_of(result, group, label):
+    return next(line for line in result.lines if (line.group, line.label) == (group, label))
+
+
+def test_every_system_stands_in_every_condition(result):
+    assert len(result.lines) == len(synthetic.CONDITIONS) * (len(TRAINED) + 3)
+    assert {line.group for line in result.lines} == {
+        "ring, 8 cameras",
+        "ring, the first 4 cameras",
+        "ring, the first 2 cameras",
+        "ring, 8 cameras, shuffled",
+        "front, 5 cameras",
+        "corners, 4 cameras",
+    }
+
+
+def test_numbers_are_means_over_frames_and_seeds(result):
+    line = line_of(result, "front, 5 cameras", "POEM v1")
+    np.testing.assert_allclose(line.ours["mpvpe_mm"], 5.0, rtol=1e-3)
+    assert line.what["MPVPE of each seed"] == "0: 4.00, 1: 6.00"
+    assert line.samples == 3
+    assert not line.absent
+
+
+def test_what_is_missing_is_said_with_the_command_that_makes_it(result):
+    line = line_of(result, "ring, 8 cameras", "POEM v2")
+    assert line.ours is None
+    assert len(line.absent) == 2
+    assert (
+        "poem train synthetic_table:v2 --train.seed 1 --train.out runs/synthetic_table_v2-1" in line.absent[1]
+    )
+    one_seed = line_of(result, "ring, 8 cameras", "MvP")
+    assert one_seed.ours is not None
+    assert len(one_seed.absent) == 1
+    assert "mvp-0" in as_markdown(result)
+
+
+def test_it_is_written_and_drawn_like_the_papers(result, tmp_path):
+    paths = write_table(tmp_path, result)
+    assert {Path(path).name for path in paths} == {"synthetic.md", "synthetic.json"}
+    rows = json.loads((tmp_path / "synthetic.json").read_text())["rows"]
+    (row,) = [row for row in rows if (row["label"], row["data"]) == ("POEM v1", "corners, 4 cameras")]
+    assert row["how"]["paper's rank"] == "1 of 8"
+    assert [point.num_views for point in curves_of(result.lines)["POEM v1"]["ours"]] == [2, 4, 8]
+    write_picture(tmp_path / "synthetic.png", result)
+    assert (tmp_path / "synthetic.png").stat().st_size > 1000
+
+
+def test_a_system_worse_than_the_turned_mean_hand_has_no_rank(result):
+    line = line_of(result, "ring, 8 cameras", "MvP")
+    assert line.ours["mpvpe_mm"] > line_of(result, "ring, 8 cameras", MEAN_ROTATED).ours["mpvpe_mm"]
+    assert NOT_FAR_ENOUGH in line.notes
+    assert line.what["rank"] == ""
+    assert line.what["paper's rank"] == "8 of 8"
+
+
+def test_ranks_are_by_error_and_baselines_have_none():
+    def line(label, error):
+        return Line("rig", label, ("mpvpe_mm",), {}, {"mpvpe_mm": error})
+
+    lines = ranked(
+        [
+            line(MEAN_ROTATED, 20.0),
+            line(FITTING, 1.0),
+            line("POEM v1", 9.0),
+            line("PE-MeshTR", 8.0),
+            line("MvP", 21.0),
+            line("v1, G-emb", 8.5)._replace(ours=None),
+        ]
+    )
+    ranks = {one.label: (one.what["rank"], one.what["paper's rank"]) for one in lines}
+    assert ranks == {
+        MEAN_ROTATED: ("", ""),
+        FITTING: ("", ""),
+        "POEM v1": ("2 of 3", "1 of 8"),
+        "PE-MeshTR": ("1 of 3", "4 of 8"),
+        "MvP": ("", "8 of 8"),
+        "v1, G-emb": ("", ""),
+    }
+
+
+def test_table_experiments_and_makefile_name_the_same_systems():
+    names = {system.name for system in TRAINED}
+    assert names == set(configs)
+    listed = re.search(r"^TABLE_SYSTEMS := (.*)$", MAKEFILE.read_text(), re.MULTILINE)
+    assert listed is not None
+    assert set(listed[1].split()) == names
+
+
+def test_captures_are_those_of_the_benchmark():
+    assert benchmark == synthetic.CAPTURES
+    assert not any(config.model.couples_samples for config in configs.values())
+    for config in configs.values():
+        drawn = config.data.synthetic
+        assert replace(drawn, cameras=benchmark.cameras, body=benchmark.body) == benchmark
+        assert config.data.seed not in {condition.rig.test_seed for condition in synthetic.CONDITIONS}
