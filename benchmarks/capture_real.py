@@ -154,7 +154,8 @@ def print_board(rig: Rig, folder: Path) -> None:
         uv = np.full((rig.num_views, columns * rows, 2), np.nan)
         for view, (corners, ids) in enumerate(found):
             if ids is not None:
-                uv[view, ids[:, 0]] = ideal_pixels(corners[:, 0] + HALF_PIXEL, rig.K[view], rig.dist[view])
+                seen = corners.reshape(-1, 2) + HALF_PIXEL
+                uv[view, ids.ravel()] = ideal_pixels(seen, rig.K[view], rig.dist[view])
         points, valid = triangulate(uv, rig.K, rig.T_cam_from_world)
         grid = np.where(np.asarray(valid)[:, None], points, np.nan).reshape(rows, columns, 3)
         for axis in (0, 1):
