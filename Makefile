@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # What `make accelerator` may take, all in all.
 MINUTES ?= 10
-# Two workers: most of the suite is compiling, which keeps one core busy each.
 TABLE_SYSTEMS := v2 ftl-meshtr pe-meshtr mvp v1 v2-row-major v1-wo-pt v1-1stage v1-wo-proj v1-g-emb v1-gv-emb
+# Two workers: most of the suite is compiling, which keeps one core busy each.
 PYTEST := $(BIN)/python -m pytest -n 2
 
 .PHONY: setup demo test test-browser test-parity test-slow lint bench accelerator synthetic-table lock clean

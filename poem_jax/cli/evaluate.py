@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 _DEFAULT_VIEWS = "1,2,4,8"
 _DEFAULT_SAMPLES = 200
 _OUT = Path("out/tables")
+_OF_ALL = frozenset({"seed", "samples", "batch_size", "no_progress", "debug"})
+_OF_TABLES = frozenset({"table", "dataset", "out", "data_root", "checkpoints"})
+_OF_DATASETS = frozenset(
+    {"dataset", "checkpoint", "protocol", "views", "json", "kind", "split", "mano", "given_root"}
+)
+_OF_EXPERIMENTS = frozenset({"experiment", "checkpoint", "protocol", "views", "json", "stages"})
+"""Options that a way of evaluating reads; another one is refused."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +100,22 @@ class Eval:
                 f"{', '.join(one for one in asked if one is not None) or 'none'}"
             )
         if self.table is not None:
+            self._check_all_are_read("--table", _OF_TABLES)
             self._run_table(self.table)
         elif self.dataset is not None:
+            self._check_all_are_read("--dataset", _OF_DATASETS)
             self._run_dataset(self.dataset)
         else:
             assert self.experiment is not None
+            self._check_all_are_read("EXPERIMENT", _OF_EXPERIMENTS)
             self._run_experiment(self.experiment)
+
+    def _check_all_are_read(self, way: str, options: frozenset[str]) -> None:
+        given = [field for field in dataclasses.fields(self) if getattr(self, field.name) != field.default]
+        unread = [field.name for field in given if field.name not in options | _OF_ALL]
+        if unread:
+            names = ", ".join("--" + name.replace("_", "-") for name in unread)
+            raise ValueError(f"{way} does not go with {names}: leave it out")
 
     def _run_table(self, name: str) -> None:
         from poem_jax.io.writable import check_folder_is_writable

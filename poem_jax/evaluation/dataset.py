@@ -132,7 +132,7 @@ def score_set(
         system: a `Network`, key-point fitting, or another.
         source: frames, in any number of views.
         settings: cameras, protocol, sizes.
-        listen: is told every hand that was found, of unsolved samples too.
+        listen: is told every hand that was found, and counts.
 
     Raises:
         ValueError: no sample can be used, or a prediction is not finite.
@@ -156,9 +156,9 @@ def score_set(
             for place, one in enumerate(read):
                 for view in one.seen.views if settings.each_view else one.seen.views[:1]:
                     hand = _in_view(answer, place, one, int(view))
-                    if listen is not None:
-                        listen(hand)
                     if answer.valid[place]:
+                        if listen is not None:
+                            listen(hand)
                         rows.append(_evaluated(hand, one, protocol, compares_vertices, system.hand))
                         keys.append(_key(one, int(view), settings.each_view))
                 unsolved += not answer.valid[place]

@@ -1,9 +1,9 @@
 """Key-point fitting as a system: 2D key points of each view, and a hand model fitted to them.
 
 Key points come from our own detector, which looks at the crops that a network would get, or from a file. The
-solver is the paper's Adam, or the one of `poem fit`. The paper does not say where its Adam begins; here it
-begins where `poem fit` does, at the pose in closed form, without which it is worse by a centimetre. Its term
-of silhouettes needs masks that no data set brings, and is left out.
+solver is the paper's Adam, or the one of `poem fit`. The authors' Adam begins near the flat hand at one place
+before the camera (`fitting.adam.released_start`); here it begins where `poem fit` does, at the pose in closed
+form. Its term of silhouettes needs masks that no data set brings, and is left out.
 """
 
 import enum
@@ -114,6 +114,11 @@ class KeypointFitting:
             T[place, :count] = anchor_to_primary(frame.T_cam_from_world[chosen], np.ones(count, bool))[0]
             diagonals.append(np.linalg.norm(frame.size_wh[chosen], axis=-1).mean())
             if (points := self._keypoints.get(frame.key)) is not None:
+                if len(points) != len(frame.images):
+                    raise ValueError(
+                        f"key points of {frame.key} must be those of its {len(frame.images)} views "
+                        f"({', '.join(frame.view_names)}); got {len(points)} views"
+                    )
                 uv[place, :count] = _as_shown(points, frame.mirror_px)[chosen]
         # Rounded, so that images of several sizes do not compile a program for each batch.
         return Observations(uv, None, K, T), float(np.round(np.mean(diagonals), -2))

@@ -7,18 +7,19 @@ What:      one trunk and first stage for all, those of the shipped model, frozen
            By name: v2, v2-row-major, v1, v1-1stage, v1-wo-proj, v1-wo-pt, v1-g-emb, v1-gv-emb, pe-meshtr,
            ftl-meshtr, mvp. `make synthetic-table` trains all of them with two seeds.
 Hardware:  2 CPU cores at the lowest priority; the same command uses every GPU or TPU it finds.
-Time:      docs/tables.md.
-Expected:  docs/tables.md.
+Time:      not measured on quiet cores; by parts of a step of v2, timed beside other work, 2,000 of its steps
+           take about an hour.
+Expected:  no number of ours yet; whether all get past the mean hand in so many steps is not known.
 Command:   poem train synthetic_table
            is v2; poem train synthetic_table:mvp another.
 """
 
 from dataclasses import replace
 
-from poem_jax.experiments.parts.table_models import TABLE_MODELS
 from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.models.config import ModelConfig
 from poem_jax.synthetic.table_rigs import RING, captures_of
+from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.training.config import (
     BatchShape,
     Clip,

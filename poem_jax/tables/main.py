@@ -2,8 +2,8 @@
 
 from poem_jax.evaluation.keypoint_fitting import Solver
 from poem_jax.tables.models import v1
-from poem_jax.tables.row import AT_20_MM, AT_50_MM, Fitting, Row
-from poem_jax.tables.splits import DEXYCB, HO3D, OAKINK
+from poem_jax.tables.row import AS_POEM, AS_PREDICTED, AT_20_MM, AT_50_MM, Checkpoint, Fitting, Row
+from poem_jax.tables.splits import DEXYCB, HO3D, OAKINK, Split
 from poem_jax.tables.table import Table
 
 POEM, MVP, PE, FTL = "POEM v1", "MvP", "PE-MeshTR", "FTL-MeshTR"
@@ -14,16 +14,28 @@ WITHOUT_MASKS = (
 )
 
 
+def _row(
+    label: str,
+    data: Split,
+    columns: tuple[str, ...],
+    system: Checkpoint,
+    number: int,
+    printed: tuple[float, ...],
+) -> Row:
+    protocol = AS_POEM if label == POEM else AS_PREDICTED
+    return Row(label, data, columns, printed, system, number, protocol=protocol)
+
+
 def _dexycb(number: int, label: str, model: str, *printed: float) -> Row:
-    return Row(label, DEXYCB, AT_20_MM, printed, v1(model, "dexycb"), number)
+    return _row(label, DEXYCB, AT_20_MM, v1(model, "dexycb"), number, printed)
 
 
 def _oakink(number: int, label: str, model: str, *printed: float) -> Row:
-    return Row(label, OAKINK, AT_20_MM, printed, v1(model, "oakink"), number)
+    return _row(label, OAKINK, AT_20_MM, v1(model, "oakink"), number, printed)
 
 
 def _ho3d(number: int, label: str, model: str, *printed: float) -> Row:
-    return Row(label, HO3D, AT_50_MM, printed, v1(model, "ho3d"), number)
+    return _row(label, HO3D, AT_50_MM, v1(model, "ho3d"), number, printed)
 
 
 table = Table(

@@ -19,8 +19,9 @@ AT_50_MM = tuple(name.replace("_20", "_50") for name in AT_20_MM)
 OFFICIAL = ("pa_mpjpe_mm", "pa_auc_j_50", "pa_mpvpe_mm", "pa_auc_v_50", "pa_f_5", "pa_f_15")
 """Of HO-3D's official evaluation; all after Procrustes alignment."""
 SHORT = ("mpvpe_mm", "pa_mpvpe_mm", "mpjpe_mm", "pa_mpjpe_mm")
-AS_POEM = "poem-release"
-"""The protocol of POEM's tables: MPJPE is of joints regressed from the mesh."""
+AS_POEM, AS_PREDICTED = "poem-release", "poem"
+"""The protocols of POEM's tables. MPJPE of POEM is of joints regressed from the mesh; that of the baselines
+of the joints that they predict, against the annotated ones."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Checkpoint:
 
     name: str
     preset: str
-    """A preset of the system that it must hold."""
+    """Whose system it must hold (`same_system`)."""
     made_by: tuple[str, ...]
     """Commands that make it, any of them; `{out}` is its folder, `{mano}` the user's MANO file."""
 

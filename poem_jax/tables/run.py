@@ -18,10 +18,10 @@ from poem_jax.evaluation.keypoint_fitting import KeypointFitting, read_keypoints
 from poem_jax.evaluation.systems import Network, System
 from poem_jax.hand.mano_file import load as load_hand
 from poem_jax.hand.template import default_hand
-from poem_jax.models.presets import preset
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings
 from poem_jax.tables.row import Checkpoint, Fitting, Quoted, Row, Shipped
+from poem_jax.tables.same_system import is_of_preset
 from poem_jax.tables.splits import Opened, OwnCapture, Split
 from poem_jax.weights.store import SHIPPED, load, read_config
 
@@ -75,10 +75,10 @@ class _Opened:
 
     def _network(self, checkpoint: Checkpoint) -> Network:
         folder = self.places.checkpoints / checkpoint.name
-        config, expected = read_config(folder), preset(checkpoint.preset)
-        if type(config) is not type(expected):
+        config = read_config(folder)
+        if not is_of_preset(config, checkpoint.preset):
             raise ValueError(
-                f"{folder} holds a {type(config).__name__}; expected a {type(expected).__name__}: "
+                f"{folder} holds another system, a {type(config).__name__}; expected {checkpoint.preset}: "
                 f"{'; or '.join(checkpoint.ways(self.places))}"
             )
         return Network(*load(folder))

@@ -25,13 +25,14 @@ from poem_jax.evaluation.captures import (
 from poem_jax.evaluation.dataset import Change, standard_error
 from poem_jax.evaluation.first_stage_fitting import FirstStageFitting
 from poem_jax.evaluation.robustness import shuffle_cameras
-from poem_jax.evaluation.systems import Network
+from poem_jax.evaluation.systems import Network, System
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import CORNERS, FRONT, RING, TEST_FRAMES, TableRig, captures_of
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
+from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.weights.store import SHIPPED, load
 
 SEEDS = (0, 1)
@@ -121,7 +122,8 @@ _NOTES = (
     f"`{CORNERS.name}` no camera stands where one stood in training. Trunk and heat maps are the shipped "
     "model's, for all, and stay as they are: they have seen random cameras.",
     "± is the standard error over frames of the mean over seeds; what each seed gives stands below. The "
-    "paper's rank is by MPVPE on DexYCB-Mv with 8 cameras, of the systems that it has there.",
+    "paper's rank is by MPVPE on DexYCB-Mv with 8 cameras, of the systems that it has there; its v2 was "
+    "trained on six sets with cameras in random order, the others on DexYCB-Mv alone.",
 )
 
 
@@ -135,7 +137,7 @@ class SyntheticTable:
     def run(self, places: Places, settings: RunSettings) -> TableResult:
         """Score every system whose checkpoints are here; say of the others how they are made."""
         samples = TEST_FRAMES if settings.samples is None else min(settings.samples, TEST_FRAMES)
-        network = cache(lambda folder: Network(*load(folder)))
+        opened = cache(partial(_opened, places))
         fitting = FirstStageFitting(*load(SHIPPED))
         lines: list[Line] = []
         rig, captures = None, []
@@ -153,16 +155,20 @@ class SyntheticTable:
             baselines = _baselines(captures, score(fitting))
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             for system in TRAINED:
-                missing = [system.missing(places, seed) for seed in SEEDS]
-                found = {
-                    seed: score(network(system.folder(places, seed)))
-                    for seed, lack in zip(SEEDS, missing, strict=True)
-                    if lack is None
-                }
+                models = {seed: opened(system, seed) for seed in SEEDS}
+                missing = [model for model in models.values() if isinstance(model, str)]
+                found: dict[int, CaptureScores] = {}
+                for seed, model in models.items():
+                    if isinstance(model, str):
+                        continue
+                    try:
+                        found[seed] = score(model)
+                    except ValueError as error:  # One that diverged costs its own line alone.
+                        missing.append(f"{system.folder(places, seed)} could not be scored: {error}")
                 line = _line(condition, system.label, list(found.values()), samples, tuple(found))
                 group.append(
                     line._replace(
-                        absent=tuple(lack for lack in missing if lack is not None),
+                        absent=tuple(missing),
                         notes=(*line.notes, *([system.note] if system.note else [])),
                     )
                 )
@@ -171,6 +177,17 @@ class SyntheticTable:
 
 
 table = SyntheticTable()
+
+
+def _opened(places: Places, system: Trained, seed: int) -> System | str:
+    """Open a trained model; say how it is made if it is not there, or what is wrong with its folder."""
+    missing = system.missing(places, seed)
+    if missing is not None:
+        return missing
+    try:
+        return Network(*load(system.folder(places, seed), expected=TABLE_MODELS[system.name]))
+    except (OSError, ValueError) as error:
+        return str(error)
 
 
 def frames_of(rig: TableRig, samples: int) -> list[MultiViewBatch]:
@@ -183,7 +200,7 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
     """Give the systems of one condition their ranks, by error, beside the paper's.
 
     Baselines have none, and neither have systems above the mean hand with true root and rotation, which are
-    marked.
+    marked; a rank is among the others.
     """
     bar = next(line.ours[ERROR] for line in lines if line.label == MEAN_ROTATED and line.ours is not None)
     papers = {system.label: system.paper_mm for system in TRAINED}
@@ -192,17 +209,24 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
         line.label: line.ours[ERROR] for line in lines if line.ours is not None and line.label in papers
     }
     far_enough = sorted(error for error in errors.values() if error <= bar)
+    of_paper = sorted(error for name, error in errors.items() if papers[name] is not None and error <= bar)
     result = []
     for line in lines:
         error, paper = errors.get(line.label), papers.get(line.label)
         if error is not None and error > bar:
             line = line._replace(notes=(NOT_FAR_ENOUGH, *line.notes))
         ranks = {
-            "rank": "" if error is None or error > bar else f"{far_enough.index(error) + 1} of {len(errors)}",
-            "paper's rank": "" if paper is None else f"{in_paper.index(paper) + 1} of {len(in_paper)}",
+            "rank": _place(error, far_enough),
+            "among the paper's systems": _place(None if paper is None else error, of_paper),
+            "paper's rank": _place(paper, in_paper),
         }
         result.append(line._replace(what={**ranks, **line.what}))
     return result
+
+
+def _place(error: float | None, among: Sequence[float]) -> str:
+    """Say which of the sorted errors one is; nothing where it is none of them."""
+    return "" if error is None or error not in among else f"{among.index(error) + 1} of {len(among)}"
 
 
 def _baselines(captures: Sequence[MultiViewBatch], fitted: CaptureScores) -> dict[str, CaptureScores]:

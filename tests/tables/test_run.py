@@ -12,13 +12,19 @@ from poem_jax.data.augmentation import augment
 from poem_jax.data.augmentation_recipes import NONE
 from poem_jax.data.sources.ho3d import HO3D
 from poem_jax.data.sources.released_tars import ReleasedTars
+from poem_jax.experiments import v1_paper
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import OPENPOSE_FROM_MANO, ROOT_JOINT, TIP_VERTICES_REGRESSED
 from poem_jax.models.apply import apply
+from poem_jax.models.frustum_config import CUBOIDS
+from poem_jax.models.presets import PRESETS, released
+from poem_jax.tables import run as run_module
 from poem_jax.tables.all_tables import TABLES, table_named
+from poem_jax.tables.models import v1, v2
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import Checkpoint, Quoted, Shipped
+from poem_jax.tables.same_system import is_of_preset
 from poem_jax.tables.table import Table
 from poem_jax.weights.store import load
 from tests.tables.conftest import write_small
@@ -59,11 +65,16 @@ def regressed(hand: HandModel, vertices: np.ndarray) -> np.ndarray:
 
 
 def check_as_poem(line: Line, folder, frame, views) -> None:
-    """Compare a row of the protocol `poem-release` of one frame with NumPy."""
-    joints, vertices, hand = found_by(folder, frame, views)
-    first = views[0]
+    """Compare a row of POEM's own, of one frame, with NumPy: joints regressed from the meshes."""
+    check_row(line, found_by(folder, frame, views), frame, views[0], from_mesh=True)
+
+
+def check_row(line: Line, found, frame, first: int, *, from_mesh: bool) -> None:
+    joints, vertices, hand = found
     truth, true_joints = frame.vertices_cam[first].astype(float), frame.joints_cam[first].astype(float)
-    ours, theirs = regressed(hand, vertices), regressed(hand, truth)
+    ours, theirs = joints, true_joints
+    if from_mesh:
+        ours, theirs = regressed(hand, vertices), regressed(hand, truth)
     expected = {
         "mpvpe_mm": error_mm(vertices, truth),
         "rr_mpvpe_mm": error_mm(vertices - ours[0], truth - theirs[0]),
@@ -184,7 +195,48 @@ def test_a_checkpoint_of_another_system_is_not_scored(places, tmp_path) -> None:
     (tmp_path / "v1-oakink").symlink_to(places.checkpoints / "v2-base")
     line = line_of(run("robustness", elsewhere), "OakInk-Mv", "POEM v1")
     assert line.ours is None
-    assert "holds a Config; expected a PoemV1Config" in line.absent[0]
+    assert "holds another system, a Config; expected v1: poem train" in line.absent[0]
+
+
+HELD = [
+    ("v1", "v1-wo-proj"),
+    ("v1-wo-proj", "v1"),
+    ("v1-g-emb", "v1"),
+    ("v1-wo-pt", "v1"),
+    ("v1-1stage", "v1"),
+    ("pe-meshtr", "ftl-meshtr"),
+    ("v2-base", "v2-large"),
+    ("v2-param", "v2-base"),
+]
+
+
+@pytest.mark.parametrize(("held", "wanted"), HELD)
+def test_an_ablation_in_the_place_of_another_is_not_scored(tmp_path, monkeypatch, held, wanted) -> None:
+    """Of the same class, so that it would run, and give another row's numbers."""
+    monkeypatch.setattr(run_module, "read_config", lambda folder: PRESETS[held])
+    checkpoint = v2(wanted) if wanted.startswith("v2") else v1(wanted, "oakink")
+    (tmp_path / checkpoint.name).mkdir()
+    told = run_module._Opened(Places(tmp_path, tmp_path)).system(checkpoint)
+    assert f"holds another system, a {type(PRESETS[held]).__name__}; expected {wanted}: poem train" in told
+
+
+RELEASED_V1 = ("v1", "v1-wo-proj", "v1-g-emb", "v1-gv-emb", "mvp", "pe-meshtr", "ftl-meshtr")
+
+
+@pytest.mark.parametrize("name", RELEASED_V1)
+@pytest.mark.parametrize("dataset", CUBOIDS)
+def test_released_and_trained_models_of_every_set_are_the_rows_systems(name, dataset) -> None:
+    assert is_of_preset(released(name, dataset=dataset), name)
+    trained = v1_paper.configs.get(f"{name}-{dataset}")
+    assert trained is None or is_of_preset(trained.model, name)
+
+
+V2_FILES = [("small", "small"), ("base", "medium"), ("large", "large"), ("param", "medium-mano")]
+
+
+@pytest.mark.parametrize(("name", "release"), V2_FILES)
+def test_released_sizes_of_v2_are_the_rows_systems(name, release) -> None:
+    assert is_of_preset(PRESETS[f"v2-{release}-release"], f"v2-{name}")
 
 
 def test_damaged_data_cost_their_rows_alone(places, tmp_path) -> None:
@@ -221,7 +273,8 @@ def test_main_and_ablation_run_and_one_row_each_is_numpys(places) -> None:
         results, ("PE-MeshTR", "w/o-proj"), ("pe-meshtr", "v1-wo-proj"), strict=True
     ):
         line = line_of(result, "OakInk-Mv", label)
-        check_as_poem(line, places.checkpoints / f"{model}-oakink", frame, range(4))
+        found = found_by(places.checkpoints / f"{model}-oakink", frame, range(4))
+        check_row(line, found, frame, 0, from_mesh=model.startswith("v1"))
 
 
 def replace_rows(table: Table, group: str) -> Table:

@@ -5,11 +5,14 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+from poem_jax.evaluation.systems import Network
 from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.experiments.synthetic_table import configs
+from poem_jax.models.apply import init
 from poem_jax.tables import synthetic
 from poem_jax.tables.all_tables import table_named
 from poem_jax.tables.layout import as_markdown, write_table
@@ -17,6 +20,8 @@ from poem_jax.tables.picture import curves_of, write_picture
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings
 from poem_jax.tables.synthetic import FITTING, MEAN_ROTATED, NOT_FAR_ENOUGH, TRAINED, ranked
+from poem_jax.tables.synthetic_models import TABLE_MODELS
+from poem_jax.weights.store import save
 from tests.evaluation.test_captures import SMALL, Shifted
 
 MAKEFILE = Path(__file__).resolve().parents[2] / "Makefile"
@@ -31,7 +36,7 @@ def result(tmp_path_factory):
         (places.checkpoints / synthetic.FOLDER / name).mkdir(parents=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "CAPTURES", SMALL)
-        patch.setattr(synthetic, "load", lambda folder: (None, Path(folder)))
+        patch.setattr(synthetic, "load", lambda folder, expected=None: (expected, Path(folder)))
         patch.setattr(synthetic, "Network", lambda config, folder: Shifted(SHIFTS[folder.name]))
         patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: Shifted(1.0))
         return table_named("synthetic").run(places, RunSettings(samples=3, batch_size=3, progress=False))
@@ -93,6 +98,16 @@ def test_a_system_worse_than_the_turned_mean_hand_has_no_rank(result):
     assert line.what["paper's rank"] == "8 of 8"
 
 
+def test_a_folder_that_holds_another_system_is_not_scored(tmp_path):
+    places = Places(tmp_path, tmp_path)
+    v1, v2 = (next(one for one in TRAINED if one.name == name) for name in ("v1", "v2"))
+    config = TABLE_MODELS["v1"]
+    save(v2.folder(places, 0), config, init(config, key=jax.random.key(0)))
+    assert "checkpoint of another config" in synthetic._opened(places, v2, 0)
+    v2.folder(places, 0).rename(v1.folder(places, 0))
+    assert isinstance(synthetic._opened(places, v1, 0), Network)
+
+
 def test_ranks_are_by_error_and_baselines_have_none():
     def line(label, error):
         return Line("rig", label, ("mpvpe_mm",), {}, {"mpvpe_mm": error})
@@ -104,17 +119,20 @@ def test_ranks_are_by_error_and_baselines_have_none():
             line("POEM v1", 9.0),
             line("PE-MeshTR", 8.0),
             line("MvP", 21.0),
+            line("v1, G&V-emb", 1.0),
             line("v1, G-emb", 8.5)._replace(ours=None),
         ]
     )
-    ranks = {one.label: (one.what["rank"], one.what["paper's rank"]) for one in lines}
+    names = ("rank", "among the paper's systems", "paper's rank")
+    ranks = {one.label: tuple(one.what[name] for name in names) for one in lines}
     assert ranks == {
-        MEAN_ROTATED: ("", ""),
-        FITTING: ("", ""),
-        "POEM v1": ("2 of 3", "1 of 8"),
-        "PE-MeshTR": ("1 of 3", "4 of 8"),
-        "MvP": ("", "8 of 8"),
-        "v1, G-emb": ("", ""),
+        MEAN_ROTATED: ("", "", ""),
+        FITTING: ("", "", ""),
+        "POEM v1": ("3 of 3", "2 of 2", "1 of 8"),
+        "PE-MeshTR": ("2 of 3", "1 of 2", "4 of 8"),
+        "MvP": ("", "", "8 of 8"),
+        "v1, G&V-emb": ("1 of 3", "", ""),
+        "v1, G-emb": ("", "", ""),
     }
 
 
