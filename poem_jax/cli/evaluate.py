@@ -129,9 +129,8 @@ class Eval:
         if self.dataset is not None and name != "real-world":
             raise ValueError(f"--dataset goes with --table real-world, or without a table; got {name}")
         check_folder_is_writable(self.out)
-        places = Places(
-            self.data_root, self.checkpoints, None if self.dataset is None else Path(self.dataset)
-        )
+        capture = None if self.dataset is None else Path(self.dataset)
+        places = Places(self.data_root, self.checkpoints, own_capture=capture)
         settings = RunSettings(
             str(self.out), self.samples, self.batch_size, self.seed, progress=not self.no_progress
         )

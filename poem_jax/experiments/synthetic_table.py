@@ -40,7 +40,7 @@ def _experiment(name: str, model: ModelConfig) -> TrainConfig:
         data=DataConfig(
             synthetic=captures_of(RING, benchmark),
             seed=870_800,
-            batches=(BatchShape(num_views=8, batch_size=8, min_views=2),),
+            batches=(BatchShape(num_views=8, batch_size=4, min_views=2),),
         ),
         loss=recipe.loss,
         frozen_first_stage=True,

@@ -11,6 +11,8 @@ class Places:
     data: Path = Path("data")
     checkpoints: Path = Path("checkpoints")
     """A folder for each model, as `poem train --export` and `poem import-torch` write them."""
+    runs: Path = Path("runs")
+    """A folder for each training run."""
     own_capture: Path | None = None
     """The labelled capture of the table of real recordings; None = `real_world` below `data`."""
 

@@ -4,7 +4,7 @@ No number of the paper's is of these captures; what can be compared is the order
 that stays above the mean hand with true root and rotation has not been trained far enough, and has no rank.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -29,10 +29,12 @@ from poem_jax.evaluation.systems import Network, System
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import CORNERS, FRONT, RING, TEST_FRAMES, TableRig, captures_of
+from poem_jax.tables.kept_scores import fingerprint, kept_scores
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
 from poem_jax.tables.synthetic_models import TABLE_MODELS
+from poem_jax.tables.training_summary import training_summary
 from poem_jax.weights.store import SHIPPED, load
 
 SEEDS = (0, 1)
@@ -60,14 +62,17 @@ class Trained:
         """Return where its model is looked for."""
         return places.checkpoints / FOLDER / f"{self.name}-{seed}"
 
+    def run(self, places: Places, seed: int) -> Path:
+        """Return where it is trained."""
+        return places.runs / f"{FOLDER}_{self.name}-{seed}"
+
     def missing(self, places: Places, seed: int) -> str | None:
         """Say how the model is made, if it is not there."""
         folder = self.folder(places, seed)
         if folder.is_dir():
             return None
         command = (
-            f"poem train synthetic_table:{self.name} --train.seed {seed} "
-            f"--train.out runs/synthetic_table_{self.name}-{seed}"
+            f"poem train synthetic_table:{self.name} --train.seed {seed} --train.out {self.run(places, seed)}"
         )
         return f"no checkpoint in {folder}: {command}; then the same with --export {folder}"
 
@@ -154,29 +159,38 @@ class SyntheticTable:
             )
             baselines = _baselines(captures, score(fitting))
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
+            drawn = fingerprint(captures)
+            asked = f"{condition.title}, batches of {settings.batch_size}, seed {settings.seed}"
             for system in TRAINED:
-                models = {seed: opened(system, seed) for seed in SEEDS}
-                missing = [model for model in models.values() if isinstance(model, str)]
+                missing: list[str] = []
                 found: dict[int, CaptureScores] = {}
-                for seed, model in models.items():
+                for seed in SEEDS:
+                    model = opened(system, seed)
                     if isinstance(model, str):
+                        missing.append(model)
                         continue
+                    folder = system.folder(places, seed)
                     try:
-                        found[seed] = score(model)
+                        found[seed] = kept_scores(folder, asked, drawn, partial(score, model))
                     except ValueError as error:  # One that diverged costs its own line alone.
-                        missing.append(f"{system.folder(places, seed)} could not be scored: {error}")
+                        missing.append(f"{folder} could not be scored: {error}")
                 line = _line(condition, system.label, list(found.values()), samples, tuple(found))
-                group.append(
-                    line._replace(
-                        absent=tuple(missing),
-                        notes=(*line.notes, *([system.note] if system.note else [])),
-                    )
-                )
+                group.append(_told(line, system, places, found)._replace(absent=tuple(missing)))
             lines += ranked(group)
         return TableResult(self.name, self.title, tuple(lines), _NOTES)
 
 
 table = SyntheticTable()
+
+
+def _told(line: Line, system: Trained, places: Places, seeds: Iterable[int]) -> Line:
+    """Add what is known of a system: how its models were trained, and the paper's note."""
+    logs = {seed: training_summary(system.run(places, seed)) for seed in seeds}
+    training = "; ".join(f"{seed}: {log}" for seed, log in logs.items() if log)
+    notes = (system.note,) if system.note else ()
+    return line._replace(
+        what={**line.what, **({"training": training} if training else {})}, notes=(*line.notes, *notes)
+    )
 
 
 def _opened(places: Places, system: Trained, seed: int) -> System | str:

@@ -23,17 +23,23 @@ from poem_jax.tables.synthetic import FITTING, MEAN_ROTATED, NOT_FAR_ENOUGH, TRA
 from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.weights.store import save
 from tests.evaluation.test_captures import SMALL, Shifted
+from tests.tables.test_kept_scores import planted_model
 
 MAKEFILE = Path(__file__).resolve().parents[2] / "Makefile"
 SHIFTS = {"v1-0": 4.0, "v1-1": 6.0, "mvp-1": 300.0}
 """Millimetres by which the stand-ins of two trained systems are wrong."""
 
+LOG_LINE = {"group": "train", "step": 50, "steps_per_second": 50 / 1800, "mpvpe_mm": 80.6}
+
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    places = Places(*(tmp_path_factory.mktemp(name) for name in ("data", "checkpoints")))
+    places = Places(*(tmp_path_factory.mktemp(name) for name in ("data", "checkpoints", "runs")))
     for name in SHIFTS:
-        (places.checkpoints / synthetic.FOLDER / name).mkdir(parents=True)
+        planted_model(places.checkpoints / synthetic.FOLDER / name)
+    log = places.runs / "synthetic_table_v1-1"
+    log.mkdir()
+    (log / "metrics.jsonl").write_text(json.dumps(LOG_LINE) + "\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "CAPTURES", SMALL)
         patch.setattr(synthetic, "load", lambda folder, expected=None: (expected, Path(folder)))
@@ -62,6 +68,7 @@ def test_numbers_are_means_over_frames_and_seeds(result):
     line = line_of(result, "front, 5 cameras", "POEM v1")
     np.testing.assert_allclose(line.ours["mpvpe_mm"], 5.0, rtol=1e-3)
     assert line.what["MPVPE of each seed"] == "0: 4.00, 1: 6.00"
+    assert line.what["training"] == "1: 50 steps, 81 to 80.6 mm, 0.5 h"
     assert line.samples == 3
     assert not line.absent
 
@@ -70,8 +77,8 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(result):
     line = line_of(result, "ring, 8 cameras", "POEM v2")
     assert line.ours is None
     assert len(line.absent) == 2
-    assert (
-        "poem train synthetic_table:v2 --train.seed 1 --train.out runs/synthetic_table_v2-1" in line.absent[1]
+    assert re.search(
+        "poem train synthetic_table:v2 --train.seed 1 --train.out .*/synthetic_table_v2-1;", line.absent[1]
     )
     one_seed = line_of(result, "ring, 8 cameras", "MvP")
     assert one_seed.ours is not None
