@@ -72,7 +72,7 @@ class KeypointFitting:
         self.hand, self.image_hw, self.recipe = hand, (CROP_SIDE_PX, CROP_SIDE_PX), NONE
         self.least_views, self.takes_root, self.one_at_a_time = 2, False, False
         self.most_views: int | None = None
-        self._keypoints, self._solver = keypoints, solver
+        self._keypoints, self._solver, self._any_known = keypoints, solver, False
         self._model = keypoint_model(hand, offsets_of(MEDIAPIPE_HANDS) if keypoints is None else None)
 
     def __call__(self, batch: MultiViewBatch, seen: Sequence[Seen]) -> Answer:
@@ -102,8 +102,21 @@ class KeypointFitting:
         return Observations(uv, None, np.asarray(K), np.asarray(T_cam_from_world)), CROP_SIDE_PX * np.sqrt(2)
 
     def _in_images(self, batch: MultiViewBatch, seen: Sequence[Seen]) -> tuple[Observations, float]:
-        """Take the file's key points, with the cameras of whole images."""
+        """Take the file's key points, with the cameras of whole images.
+
+        Raises:
+            ValueError: key points of another number of views, cameras that were changed after the frames
+                were read, or a first batch of which the file knows no frame.
+        """
         assert self._keypoints is not None
+        if not self._any_known:
+            self._any_known = any(frame.key in self._keypoints for frame, _ in seen)
+            if not self._any_known and seen:
+                own = next(iter(self._keypoints), None)
+                raise ValueError(
+                    f"key points must be stored under the keys of the frames, such as {seen[0][0].key!r}; "
+                    f"the file has none of the first batch, and keys such as {own!r}"
+                )
         size, views = batch.views.shape[:2]
         uv = np.full((size, views, NUM_JOINTS, 2), np.nan, np.float32)
         K, T = np.array(batch.cameras.K), np.array(batch.cameras.T_cam_from_world)
@@ -111,7 +124,13 @@ class KeypointFitting:
         for place, (frame, chosen) in enumerate(seen):
             count = len(chosen)
             K[place, :count] = frame.K[chosen]
-            T[place, :count] = anchor_to_primary(frame.T_cam_from_world[chosen], np.ones(count, bool))[0]
+            own = anchor_to_primary(frame.T_cam_from_world[chosen], np.ones(count, bool))[0]
+            if not np.allclose(T[place, :count], own, atol=1e-3):
+                raise ValueError(
+                    f"key points of a file go with the cameras of {frame.key} as they were read; these were "
+                    "changed. Score changed cameras with a network, or with key points found in the crops"
+                )
+            T[place, :count] = own
             diagonals.append(np.linalg.norm(frame.size_wh[chosen], axis=-1).mean())
             if (points := self._keypoints.get(frame.key)) is not None:
                 if len(points) != len(frame.images):

@@ -63,6 +63,7 @@ def as_json(result: TableResult) -> dict[str, Any]:
                 "standard_error": _numbers(line.spread),
                 "samples": line.samples,
                 "views": line.num_views,
+                "ranks": dict(line.ranks),
                 "how": dict(line.what),
                 "notes": list(line.notes),
                 "absent": list(line.absent),
@@ -95,7 +96,8 @@ def degrade_percent(numbers: Mapping[str, float], base: Mapping[str, float]) -> 
 def _group(title: str, lines: Sequence[Line]) -> list[str]:
     """Write the lines of one data set under their own head."""
     columns = [COLUMNS[name] for name in lines[0].columns]
-    head = ["#", "method", *(column.title for column in columns), "±", "samples"]
+    ranks = list(dict.fromkeys(name for line in lines for name in line.ranks))
+    head = ["#", "method", *(column.title for column in columns), "±", "samples", *ranks]
     rows = []
     for line in lines:
         ours = line.ours or {}
@@ -103,12 +105,13 @@ def _group(title: str, lines: Sequence[Line]) -> list[str]:
         error = line.spread.get(columns[0].metric)
         spread = ABSENT if error is None or math.isnan(error) else f"{error:.{columns[0].decimals}f}"
         number = "" if line.number is None else str(line.number)
+        count = ABSENT if line.samples is None else str(line.samples)
         rows.append(
-            [number, line.label, *cells, spread, ABSENT if line.samples is None else str(line.samples)]
+            [number, line.label, *cells, spread, count, *(line.ranks.get(name, "") for name in ranks)]
         )
         base = next((one for one in lines if one.label == line.against), None)
         if base is not None:
-            rows.append(["", "% degrade", *_degrade_cells(line, base, columns), "", ""])
+            rows.append(["", "% degrade", *_degrade_cells(line, base, columns), "", "", *[""] * len(ranks)])
     return [f"## {title}", "", *_markdown_rows(head, rows)]
 
 

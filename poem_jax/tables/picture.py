@@ -1,6 +1,6 @@
 """A table as a picture: bars by system, and the error over the number of views; drawn by OpenCV.
 
-The paper's numbers are grey, ours blue. What is drawn is the first column of each line.
+The paper's bars are grey, ours blue. What is drawn is the first column of each line.
 """
 
 import os
@@ -19,7 +19,7 @@ from poem_jax.typing import UInt8
 
 WIDTH = 1000
 _ROW, _HEAD, _MARGIN, _LABELS, _VALUES = 34, 44, 24, 320, 70
-_CURVE_HEIGHT = 360
+_CURVE_HEIGHT, _NAME_HEIGHT = 360, 16
 _GREY, _BLUE, _INK, _PALE = (170, 170, 170), (190, 110, 30), (40, 40, 40), (225, 225, 225)
 """BGR, as OpenCV has colours."""
 
@@ -76,7 +76,8 @@ def draw_bars(title: str, lines: Sequence[Line]) -> UInt8[np.ndarray, "h w 3"]:
     longest = max((value for pair in values for value in pair if value is not None), default=1.0)
     image = np.full((_HEAD + _ROW * len(lines) + _MARGIN // 2, WIDTH, 3), 255, np.uint8)
     _text(image, f"{title}: {column.title}", (_MARGIN, 30), bold=True)
-    _legend(image)
+    if any(paper is not None for paper, _ in values):
+        _legend(image)
     scale = (WIDTH - _LABELS - _VALUES - _MARGIN) / longest
     for number, (line, pair) in enumerate(zip(lines, values, strict=True)):
         top = _HEAD + _ROW * number
@@ -91,14 +92,19 @@ def draw_bars(title: str, lines: Sequence[Line]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def draw_curves(curves: dict[str, dict[str, list[Point]]], column: Column) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw the error over the number of views, a thin line the paper's and a thick one ours; BGR."""
+    """Draw the error over the number of views, a thin line the paper's and a thick one ours; BGR.
+
+    Each series has its own colour and is named at its right end; names keep apart from each other.
+    """
     every = [point for both in curves.values() for points in both.values() for point in points]
     low, high = min(p.num_views for p in every), max(p.num_views for p in every)
     top = 1.1 * max(p.value for p in every)
-    image = np.full((_CURVE_HEIGHT, WIDTH, 3), 255, np.uint8)
+    height = max(_CURVE_HEIGHT, 110 + _NAME_HEIGHT * len(curves))
+    image = np.full((height, WIDTH, 3), 255, np.uint8)
     _text(image, f"{column.title} over the number of views", (_MARGIN, 30), bold=True)
-    _legend(image)
-    left, right, floor, roof = 80, WIDTH - _LABELS, _CURVE_HEIGHT - 40, 60
+    if any(both["paper"] for both in curves.values()):
+        _text(image, "thin: paper, thick: ours", (WIDTH - 210, 29), size=0.4)
+    left, right, floor, roof = 80, WIDTH - _LABELS - 40, height - 40, 60
 
     def place(point: Point) -> tuple[int, int]:
         across = (point.num_views - low) / max(high - low, 1)
@@ -111,15 +117,44 @@ def draw_curves(curves: dict[str, dict[str, list[Point]]], column: Column) -> UI
     for count in sorted({point.num_views for point in every}):
         x, _ = place(Point(count, 0.0))
         _text(image, str(count), (x - 4, floor + 22))
+    colors = dict(zip(curves, _colors(len(curves)), strict=True))
     for series, both in curves.items():
-        for points, color, width in ((both["paper"], _GREY, 1), (both["ours"], _BLUE, 2)):
+        for points, width in ((both["paper"], 1), (both["ours"], 2)):
             corners = [place(point) for point in points]
-            cv2.polylines(image, [np.array(corners, np.int32)], False, color, width, cv2.LINE_AA)
+            cv2.polylines(image, [np.array(corners, np.int32)], False, colors[series], width, cv2.LINE_AA)
             for corner in corners:
-                cv2.circle(image, corner, 3, color, cv2.FILLED, cv2.LINE_AA)
-        x, y = place(max(both["ours"] or both["paper"]))
-        _text(image, series[:40], (min(x + 10, right + 10), y + 4), size=0.4)
+                cv2.circle(image, corner, 3, colors[series], cv2.FILLED, cv2.LINE_AA)
+    ends = {series: place(max(both["ours"] or both["paper"])) for series, both in curves.items()}
+    heights = spread_out([y for _, y in ends.values()], _NAME_HEIGHT, roof - 10, floor)
+    for (series, end), y in zip(ends.items(), heights, strict=True):
+        cv2.line(image, (end[0] + 5, end[1]), (right + 22, y), colors[series], 1, cv2.LINE_AA)
+        _text(image, series[:46], (right + 26, y + 4), size=0.4, color=colors[series])
     return image
+
+
+def spread_out(wanted: Sequence[int], gap: int, low: int, high: int) -> list[int]:
+    """Return whole numbers near those wanted, in their order, `gap` or more apart and from `low` to `high`.
+
+    Where there is no room for all, they go beyond `high`.
+    """
+    order = np.argsort(wanted, kind="stable")
+    placed = np.asarray(wanted, float)[order]
+    for number in range(len(placed) - 1, -1, -1):
+        ceiling = high if number == len(placed) - 1 else placed[number + 1] - gap
+        placed[number] = min(placed[number], ceiling)
+    for number in range(len(placed)):
+        floor = low if number == 0 else placed[number - 1] + gap
+        placed[number] = max(placed[number], floor)
+    result = np.empty(len(placed), int)
+    result[order] = np.round(placed)
+    return result.tolist()
+
+
+def _colors(count: int) -> list[tuple[int, int, int]]:
+    """Return colours of evenly spread hues, light and dark by turns, BGR."""
+    hsv = [(179 * number / max(count, 1), 220, 200 if number % 2 else 130) for number in range(count)]
+    bgr = cv2.cvtColor(np.array([hsv], np.uint8), cv2.COLOR_HSV2BGR)[0]
+    return [(int(b), int(g), int(r)) for b, g, r in bgr]
 
 
 def _column(line: Line) -> Column:
@@ -134,8 +169,14 @@ def _legend(image: np.ndarray) -> None:
 
 
 def _text(
-    image: np.ndarray, text: str, at: tuple[int, int], *, size: float = 0.48, bold: bool = False
+    image: np.ndarray,
+    text: str,
+    at: tuple[int, int],
+    *,
+    size: float = 0.48,
+    bold: bool = False,
+    color: tuple[int, int, int] = _INK,
 ) -> None:
     # OpenCV's letters are ASCII's.
     plain = text.encode("ascii", "replace").decode()
-    cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 2 if bold else 1, cv2.LINE_AA)
+    cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, 2 if bold else 1, cv2.LINE_AA)

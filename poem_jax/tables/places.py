@@ -35,3 +35,7 @@ class Places:
     def capture(self) -> Path:
         """Of a real recording with labels."""
         return self.data / "real_world" if self.own_capture is None else self.own_capture
+
+    def keypoints(self, name: str) -> Path:
+        """Return where key points of a set are looked for; those of one's own capture lie within it."""
+        return self.data / name if self.own_capture is None else self.own_capture / "keypoints.npz"

@@ -91,7 +91,7 @@ class _Opened:
 
     def keypoints(self, fitting: Fitting) -> Path | None:
         """Return the file of key points, if it is there."""
-        file = None if fitting.keypoints is None else self.places.data / fitting.keypoints
+        file = None if fitting.keypoints is None else self.places.keypoints(fitting.keypoints)
         return file if file is not None and file.is_file() else None
 
 

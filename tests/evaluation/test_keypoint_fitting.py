@@ -10,6 +10,7 @@ from poem_jax.data.view_sampling import UniformViews
 from poem_jax.evaluation import keypoint_fitting
 from poem_jax.evaluation.dataset import SetSettings, score_set
 from poem_jax.evaluation.keypoint_fitting import KeypointFitting, read_keypoints
+from poem_jax.evaluation.robustness import shuffle_cameras
 from poem_jax.geometry.cameras import project_cam
 from poem_jax.geometry.transforms import transform_points
 from poem_jax.hand.template import default_hand
@@ -37,7 +38,7 @@ def test_points_of_a_file_and_the_cameras_of_whole_images_fit_each_other(source,
         if frame.mirror_px is not None:
             points[..., 0] = 2 * frame.mirror_px[:, None] - points[..., 0]
         stored[frame.key] = points
-    stored.pop("take/000001")
+    stored.pop("take/000001")  # The file need not know every frame.
     asked = []
 
     def fit(model, seen, start, *, config, diagonal_px):
@@ -68,6 +69,31 @@ def test_points_of_a_file_and_the_cameras_of_whole_images_fit_each_other(source,
         projected = project_cam(seen.K[row], transform_points(seen.T_cam_from_world[row], world[None]))
         np.testing.assert_allclose(projected[shown], seen.uv_px[row][shown], atol=0.05)
     assert {diagonal for _, diagonal in asked} == {400.0}
+
+
+def stored_of(source):
+    return {source[index].key: source[index].keypoints_px for index in range(len(source))}
+
+
+def test_a_file_that_knows_none_of_the_frames_is_refused() -> None:
+    source = FakeFrames(length=2)
+    stored = {f"other/{key}": points for key, points in stored_of(source).items()}
+    with pytest.raises(ValueError, match=r"such as 'take/000000'; .* such as 'other/take/000000'"):
+        score_set(KeypointFitting(default_hand(), stored), source, QUIET)
+
+
+def test_a_file_of_other_views_is_refused() -> None:
+    source = FakeFrames(length=2)
+    stored = {key: points[:-1] for key, points in stored_of(source).items()}
+    with pytest.raises(ValueError, match=r"key points of take/000000 must be those of its \d views"):
+        score_set(KeypointFitting(default_hand(), stored), source, QUIET)
+
+
+def test_key_points_of_a_file_do_not_go_with_changed_cameras() -> None:
+    source = FakeFrames(length=2)
+    system = KeypointFitting(default_hand(), stored_of(source))
+    with pytest.raises(ValueError, match="as they were read; these were changed"):
+        score_set(system, source, replace(QUIET, change=shuffle_cameras))
 
 
 def test_our_detector_looks_at_valid_crops_and_takes_the_surest_right_hand(monkeypatch) -> None:

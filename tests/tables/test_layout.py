@@ -9,7 +9,7 @@ import pytest
 
 from poem_jax.tables.all_tables import TABLES
 from poem_jax.tables.layout import COLUMNS, as_json, as_markdown, degrade_percent, write_table
-from poem_jax.tables.picture import curves_of, draw_table, write_picture
+from poem_jax.tables.picture import curves_of, draw_table, spread_out, write_picture
 from poem_jax.tables.result import Line, TableResult
 from poem_jax.tables.row import SHORT
 from poem_jax.tables.table import Table
@@ -127,3 +127,13 @@ def test_numbers_are_the_papers(shared_dir) -> None:
         table = TABLES[name]
         assert isinstance(table, Table)
         assert [row.printed for row in table.rows if row.printed] == printed
+
+
+def test_names_of_curves_keep_apart_in_their_order():
+    assert spread_out([10, 200, 100], 16, 0, 300) == [10, 200, 100]
+    crowded = spread_out([50, 52, 51, 300, 299], 16, 40, 300)
+    assert sorted(crowded) == [crowded[i] for i in (0, 2, 1, 4, 3)]
+    assert min(np.diff(sorted(crowded))) >= 16
+    assert min(crowded) >= 40
+    assert max(crowded) <= 300
+    assert spread_out([5] * 3, 16, 0, 20) == [0, 16, 32]

@@ -91,7 +91,7 @@ def test_it_is_written_and_drawn_like_the_papers(result, tmp_path):
     assert {Path(path).name for path in paths} == {"synthetic.md", "synthetic.json"}
     rows = json.loads((tmp_path / "synthetic.json").read_text())["rows"]
     (row,) = [row for row in rows if (row["label"], row["data"]) == ("POEM v1", "corners, 4 cameras")]
-    assert row["how"]["paper's rank"] == "1 of 8"
+    assert row["ranks"]["paper's rank"] == "1 of 8"
     assert [point.num_views for point in curves_of(result.lines)["POEM v1"]["ours"]] == [2, 4, 8]
     write_picture(tmp_path / "synthetic.png", result)
     assert (tmp_path / "synthetic.png").stat().st_size > 1000
@@ -101,8 +101,16 @@ def test_a_system_worse_than_the_turned_mean_hand_has_no_rank(result):
     line = line_of(result, "ring, 8 cameras", "MvP")
     assert line.ours["mpvpe_mm"] > line_of(result, "ring, 8 cameras", MEAN_ROTATED).ours["mpvpe_mm"]
     assert NOT_FAR_ENOUGH in line.notes
-    assert line.what["rank"] == ""
-    assert line.what["paper's rank"] == "8 of 8"
+    assert line.ranks["rank"] == ""
+    assert line.ranks["paper's rank"] == "8 of 8"
+
+
+def test_ranks_stand_beside_the_numbers(result):
+    _, table = as_markdown(result).split("## ring, 8 cameras\n\n", 1)
+    head, _, *rows = table.split("\n\n")[0].splitlines()
+    assert head.endswith("| samples | rank | among the paper's systems | paper's rank |")
+    (row,) = [row for row in rows if row.startswith("|  | POEM v1 ")]
+    assert row.endswith("| 3 | 1 of 1 | 1 of 1 | 1 of 8 |")
 
 
 def test_a_folder_that_holds_another_system_is_not_scored(tmp_path):
@@ -131,7 +139,7 @@ def test_ranks_are_by_error_and_baselines_have_none():
         ]
     )
     names = ("rank", "among the paper's systems", "paper's rank")
-    ranks = {one.label: tuple(one.what[name] for name in names) for one in lines}
+    ranks = {one.label: tuple(one.ranks[name] for name in names) for one in lines}
     assert ranks == {
         MEAN_ROTATED: ("", "", ""),
         FITTING: ("", "", ""),
