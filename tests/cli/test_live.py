@@ -9,6 +9,7 @@ import pytest
 
 import poem_jax.detection
 from poem_jax.calibration.rig_json import write_rig
+from poem_jax.capture.live import line as line  # Before the names in its annotations are replaced.
 from poem_jax.capture.live import newest, sources
 from poem_jax.cli import main
 from poem_jax.cli.live import Live
