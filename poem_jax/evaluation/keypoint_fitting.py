@@ -72,7 +72,8 @@ class KeypointFitting:
         self.hand, self.image_hw, self.recipe = hand, (CROP_SIDE_PX, CROP_SIDE_PX), NONE
         self.least_views, self.takes_root, self.one_at_a_time = 2, False, False
         self.most_views: int | None = None
-        self._keypoints, self._solver, self._any_known = keypoints, solver, False
+        self._keypoints, self._solver = keypoints, solver
+        self._asked, self._any_known = "", False
         self._model = keypoint_model(hand, offsets_of(MEDIAPIPE_HANDS) if keypoints is None else None)
 
     def __call__(self, batch: MultiViewBatch, seen: Sequence[Seen]) -> Answer:
@@ -88,6 +89,17 @@ class KeypointFitting:
         else:
             found = fit_take(self._model, observed, config=config)
         return Answer(*map(np.asarray, (found.joints, found.vertices, found.valid)))
+
+    @property
+    def unknown_keys(self) -> str | None:
+        """What is wrong with a file that knew none of the frames so far; None = nothing."""
+        if self._keypoints is None or self._any_known or not self._asked:
+            return None
+        own = next(iter(self._keypoints), None)
+        return (
+            f"key points must be stored under the keys of the frames, such as {self._asked!r}; the file "
+            f"knows none of them, and has keys such as {own!r}"
+        )
 
     def _in_crops(self, batch: MultiViewBatch) -> tuple[Observations, float]:
         """Look for the right hand in every valid crop; the surest, where there are more."""
@@ -105,34 +117,28 @@ class KeypointFitting:
         """Take the file's key points, with the cameras of whole images.
 
         Raises:
-            ValueError: key points of another number of views, cameras that were changed after the frames
-                were read, or a first batch of which the file knows no frame.
+            ValueError: key points of another number of views, or cameras that were changed after the frames
+                were read.
         """
         assert self._keypoints is not None
-        if not self._any_known:
-            self._any_known = any(frame.key in self._keypoints for frame, _ in seen)
-            if not self._any_known and seen:
-                own = next(iter(self._keypoints), None)
-                raise ValueError(
-                    f"key points must be stored under the keys of the frames, such as {seen[0][0].key!r}; "
-                    f"the file has none of the first batch, and keys such as {own!r}"
-                )
         size, views = batch.views.shape[:2]
         uv = np.full((size, views, NUM_JOINTS, 2), np.nan, np.float32)
         K, T = np.array(batch.cameras.K), np.array(batch.cameras.T_cam_from_world)
         diagonals = []
         for place, (frame, chosen) in enumerate(seen):
             count = len(chosen)
-            K[place, :count] = frame.K[chosen]
             own = anchor_to_primary(frame.T_cam_from_world[chosen], np.ones(count, bool))[0]
-            if not np.allclose(T[place, :count], own, atol=1e-3):
+            shown = np.asarray(batch.cameras.view_mask[place])
+            if shown.sum() != count or not np.allclose(T[place][shown], own, atol=1e-5):
                 raise ValueError(
                     f"key points of a file go with the cameras of {frame.key} as they were read; these were "
                     "changed. Score changed cameras with a network, or with key points found in the crops"
                 )
-            T[place, :count] = own
+            K[place, :count], T[place, :count] = frame.K[chosen], own
             diagonals.append(np.linalg.norm(frame.size_wh[chosen], axis=-1).mean())
+            self._asked = self._asked or frame.key
             if (points := self._keypoints.get(frame.key)) is not None:
+                self._any_known = True
                 if len(points) != len(frame.images):
                     raise ValueError(
                         f"key points of {frame.key} must be those of its {len(frame.images)} views "

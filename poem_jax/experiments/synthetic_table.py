@@ -2,14 +2,14 @@
 
 What:      one trunk and first stage for all, those of the shipped model, frozen; what comes after them is
            trained: the same captures of the rig `ring` in the same order, 2 to 8 views in the rig's own
-           order, batch 8, Adam 4e-4 with a warm-up and a cosine, each system's own losses. Tested on new
+           order, batch 4, Adam 4e-4 with a warm-up and a cosine, each system's own losses. Tested on new
            captures of that rig, and on two others (`poem eval --table synthetic`).
            By name: v2, v2-row-major, v1, v1-1stage, v1-wo-proj, v1-wo-pt, v1-g-emb, v1-gv-emb, pe-meshtr,
            ftl-meshtr, mvp. `make synthetic-table` trains all of them with two seeds.
 Hardware:  2 CPU cores at the lowest priority; the same command uses every GPU or TPU it finds.
-Time:      not measured on quiet cores; by parts of a step of v2, timed beside other work, 2,000 of its steps
-           take about an hour.
-Expected:  no number of ours yet; whether all get past the mean hand in so many steps is not known.
+Time:      with other work beside them, 0.7 h for v2 and 0.6 h for mvp; all 22 runs about 14 h.
+Expected:  not far enough: 8,000 captures bring v2 to 26 mm at 8 views, mvp to 54 mm on training batches, and
+           the mean hand with true root and rotation is at 18 mm. See docs/tables.md.
 Command:   poem train synthetic_table
            is v2; poem train synthetic_table:mvp another.
 """

@@ -39,10 +39,13 @@ def kept_scores(
             return CaptureScores(rows, kept["unsolved"])
     scores = score()
     rows = {name: values.tolist() for name, values in scores.rows.items()}
-    file.parent.mkdir(exist_ok=True)
-    with whole_file(file) as temporary:
-        kept = {"of": made_of, "unsolved": scores.unsolved, "rows": rows}
-        temporary.write_text(json.dumps(kept, allow_nan=False), encoding="utf-8")
+    kept = json.dumps({"of": made_of, "unsolved": scores.unsolved, "rows": rows}, allow_nan=False)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(file) as temporary:
+            temporary.write_text(kept, encoding="utf-8")
+    except OSError as error:
+        _log.warning("%s: scores are not kept: %s", condition, error)
     return scores
 
 

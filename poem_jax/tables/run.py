@@ -129,6 +129,8 @@ def _line(table: str, row: Row, opened: _Opened, settings: RunSettings, files: l
         scores = score_set(system, data.source, _settings(row, settings), _listener(hands, data.source))
     except ValueError as error:
         return line._replace(absent=(f"could not be scored: {error}",))
+    if isinstance(system, KeypointFitting) and system.unknown_keys is not None:
+        return line._replace(absent=(f"could not be scored: {system.unknown_keys}",))
     notes = [*line.notes, *notes_of(scores)]
     if hands is not None:
         notes.append(_submit(hands, Path(settings.out) / f"{table}_submission.zip", files))

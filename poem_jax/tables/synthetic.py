@@ -4,7 +4,7 @@ No number of the paper's is of these captures; what can be compared is the order
 that stays above the mean hand with true root and rotation has not been trained far enough, and has no rank.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -83,7 +83,7 @@ TRAINED = (
     Trained(
         "v2-row-major",
         "POEM v2, row-major fusion",
-        note="fuses views as the released models do, which mixes samples in memory; not in the paper",
+        note="fuses views as the release does, which mixes views, channels and points; not in the paper",
     ),
     Trained("v1", "POEM v1", 6.13),
     Trained("v1-1stage", "v1, 1stage", 9.42),
@@ -164,7 +164,7 @@ class SyntheticTable:
             baselines = _baselines(captures, score(fitting))
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             drawn = fingerprint(captures)
-            asked = f"{condition.title}, batches of {settings.batch_size}, seed {settings.seed}"
+            asked = f"{condition.title}, {samples} frames by {settings.batch_size}, seed {settings.seed}"
             for system in TRAINED:
                 missing: list[str] = []
                 found: dict[int, CaptureScores] = {}
@@ -227,7 +227,11 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
         line.label: line.ours[ERROR] for line in lines if line.ours is not None and line.label in papers
     }
     far_enough = sorted(error for error in errors.values() if error <= bar)
-    of_paper = sorted(error for name, error in errors.items() if papers[name] is not None and error <= bar)
+    of_paper = {
+        name: (error, paper)
+        for name, error in errors.items()
+        if (paper := papers[name]) is not None and error <= bar
+    }
     result = []
     for line in lines:
         error, paper = errors.get(line.label), papers.get(line.label)
@@ -235,7 +239,7 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
             line = line._replace(notes=(NOT_FAR_ENOUGH, *line.notes))
         ranks = {
             "rank": _place(error, far_enough),
-            "among the paper's systems": _place(None if paper is None else error, of_paper),
+            "of the paper's systems (in the paper)": _beside(line.label, of_paper),
             "paper's rank": _place(paper, in_paper),
         }
         result.append(line._replace(ranks=ranks))
@@ -245,6 +249,15 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
 def _place(error: float | None, among: Sequence[float]) -> str:
     """Say which of the sorted errors one is; nothing where it is none of them."""
     return "" if error is None or error not in among else f"{among.index(error) + 1} of {len(among)}"
+
+
+def _beside(name: str, numbers: Mapping[str, tuple[float, float]]) -> str:
+    """Say a system's place among the same systems by our numbers, and by the paper's."""
+    if name not in numbers:
+        return ""
+    ours, papers = (sorted(column) for column in zip(*numbers.values(), strict=True))
+    error, paper = numbers[name]
+    return f"{_place(error, ours)} ({papers.index(paper) + 1})"
 
 
 def _baselines(captures: Sequence[MultiViewBatch], fitted: CaptureScores) -> dict[str, CaptureScores]:

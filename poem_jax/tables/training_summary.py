@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 _METRICS = "metrics.jsonl"
 """As `poem train` writes it."""
@@ -16,8 +17,8 @@ def training_summary(run: Path) -> str:
     file = run / _METRICS
     if not file.is_file():
         return ""
-    lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()]
-    by_step = {line["step"]: line for line in lines if line["group"] == "train"}
+    lines = map(_entry, file.read_text(encoding="utf-8").splitlines())
+    by_step = {line["step"]: line for line in lines if line.get("group") == "train"}
     if not by_step:
         return ""
     steps = sorted(by_step)
@@ -26,4 +27,12 @@ def training_summary(run: Path) -> str:
         for before, step in zip([0, *steps], steps, strict=False)
     )
     first, last = (by_step[step]["mpvpe_mm"] for step in (steps[0], steps[-1]))
-    return f"{steps[-1]} steps, {first:.0f} to {last:.1f} mm, {seconds / 3600:.1f} h"
+    return f"{steps[-1]} steps, training MPVPE {first:.0f} to {last:.1f} mm, {seconds / 3600:.1f} h"
+
+
+def _entry(text: str) -> dict[str, Any]:
+    """Read a line; nothing where it is cut, as by a run that is still writing or was killed."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return {}

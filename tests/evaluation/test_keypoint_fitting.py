@@ -1,5 +1,6 @@
 """Key points from a file or of our detector, as the paper's optimisation is given them."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from poem_jax.data.right_hand import as_right_hand
 from poem_jax.data.view_sampling import UniformViews
 from poem_jax.evaluation import keypoint_fitting
 from poem_jax.evaluation.dataset import SetSettings, score_set
-from poem_jax.evaluation.keypoint_fitting import KeypointFitting, read_keypoints
+from poem_jax.evaluation.keypoint_fitting import KeypointFitting, Solver, read_keypoints
 from poem_jax.evaluation.robustness import shuffle_cameras
 from poem_jax.geometry.cameras import project_cam
 from poem_jax.geometry.transforms import transform_points
@@ -75,11 +76,28 @@ def stored_of(source):
     return {source[index].key: source[index].keypoints_px for index in range(len(source))}
 
 
-def test_a_file_that_knows_none_of_the_frames_is_refused() -> None:
+@pytest.mark.parametrize("known", [False, True])
+def test_a_file_that_knows_none_of_the_frames_is_told(known, monkeypatch) -> None:
     source = FakeFrames(length=2)
     stored = {f"other/{key}": points for key, points in stored_of(source).items()}
-    with pytest.raises(ValueError, match=r"such as 'take/000000'; .* such as 'other/take/000000'"):
-        score_set(KeypointFitting(default_hand(), stored), source, QUIET)
+    if known:  # The last frame alone, which stands in the second batch.
+        stored["take/000001"] = source[1].keypoints_px
+    system = KeypointFitting(default_hand(), stored, solver=Solver.LEVENBERG_MARQUARDT)
+    monkeypatch.setattr(keypoint_fitting, "fit_take", lambda model, seen, **_: unsolved(len(seen.uv_px)))
+    assert system.unknown_keys is None
+    score_set(system, source, replace(QUIET, batch_size=1))
+    if known:
+        assert system.unknown_keys is None
+    else:
+        assert re.search("such as 'take/000000'; .* such as 'other/take/000000'", str(system.unknown_keys))
+
+
+def unsolved(size):
+    class Fit:
+        joints, vertices = np.zeros((size, 21, 3)), np.zeros((size, 778, 3))
+        valid = np.zeros(size, bool)
+
+    return Fit
 
 
 def test_a_file_of_other_views_is_refused() -> None:
@@ -89,11 +107,24 @@ def test_a_file_of_other_views_is_refused() -> None:
         score_set(KeypointFitting(default_hand(), stored), source, QUIET)
 
 
-def test_key_points_of_a_file_do_not_go_with_changed_cameras() -> None:
+def moved_a_little(batch, *, key):
+    T = batch.cameras.T_cam_from_world.copy()
+    T[:, 1, 0, 3] += 5e-4
+    return batch._replace(cameras=batch.cameras._replace(T_cam_from_world=T))
+
+
+def second_left_out(batch, *, key):
+    mask = batch.cameras.view_mask.copy()
+    mask[:, 1] = False
+    return batch._replace(cameras=batch.cameras._replace(view_mask=mask))
+
+
+@pytest.mark.parametrize("change", [shuffle_cameras, moved_a_little, second_left_out])
+def test_key_points_of_a_file_do_not_go_with_changed_cameras(change) -> None:
     source = FakeFrames(length=2)
     system = KeypointFitting(default_hand(), stored_of(source))
     with pytest.raises(ValueError, match="as they were read; these were changed"):
-        score_set(system, source, replace(QUIET, change=shuffle_cameras))
+        score_set(system, source, replace(QUIET, change=change))
 
 
 def test_our_detector_looks_at_valid_crops_and_takes_the_surest_right_hand(monkeypatch) -> None:

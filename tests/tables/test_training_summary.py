@@ -12,9 +12,11 @@ def test_it_says_steps_errors_and_hours(tmp_path):
         {"group": "train", "step": 200, "steps_per_second": 0.1, "mpvpe_mm": 50.0},
         {"group": "train", "step": 200, "steps_per_second": 0.25, "mpvpe_mm": 45.25},
     ]
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (tmp_path / "metrics.jsonl").write_text(
+        "".join(json.dumps(line) + "\n" for line in lines) + '{"group": "tr'
+    )
     # 100 steps of 2 s, and 100 of 4 s, which were taken again after a stop.
-    assert training_summary(tmp_path) == f"200 steps, 70 to 45.2 mm, {600 / 3600:.1f} h"
+    assert training_summary(tmp_path) == f"200 steps, training MPVPE 70 to 45.2 mm, {600 / 3600:.1f} h"
 
 
 def test_without_a_log_it_says_nothing(tmp_path):
