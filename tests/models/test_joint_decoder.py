@@ -15,7 +15,7 @@ from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
 from poem_jax.hand.model import template_queries
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, ROOT_JOINT, QueryOrder, split_queries
-from poem_jax.models.config import FirstQueries, JointDecoderConfig
+from poem_jax.models.config import FirstQueries, Frozen, JointDecoderConfig
 from poem_jax.models.decoder import JointDecoder, cloud, read_evidence
 from poem_jax.models.network import forward
 from poem_jax.models.point_features import evidence
@@ -207,7 +207,7 @@ def test_unsolved_samples_rest_and_disturb_no_gradient(joints_config, make_param
 
     @jax.jit
     def of_first_layer(trainable, images, cams, root):
-        run = functools.partial(forward, config=joints_config, train=True, frozen_views=True)
+        run = functools.partial(forward, config=joints_config, train=True, frozen=Frozen.VIEWS)
 
         def loss(trainable):
             found = run({**params, "trainable": trainable}, images, cams, root_world=root)[0]
