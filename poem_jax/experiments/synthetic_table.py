@@ -8,8 +8,8 @@ What:      one trunk and first stage for all, those of the shipped model, frozen
            ftl-meshtr, mvp. `make synthetic-table` trains all of them with two seeds.
 Hardware:  2 CPU cores at the lowest priority; the same command uses every GPU or TPU it finds.
 Time:      with other work beside them, 0.7 h for v2 and 0.6 h for mvp; all 22 runs about 14 h.
-Expected:  not far enough: 8,000 captures bring v2 to 26 mm at 8 views, mvp to 54 mm on training batches, and
-           the mean hand with true root and rotation is at 18 mm. See docs/tables.md.
+Expected:  not far enough: 8,000 captures bring v2 to 28 mm at 8 views of the rig and mvp to 53, where the
+           mean hand with true root and rotation is at 19. See docs/tables.md.
 Command:   poem train synthetic_table
            is v2; poem train synthetic_table:mvp another.
 """
