@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,19 +32,17 @@ def kept_scores(
     words = "-".join(re.findall(r"\w+", condition))
     file = model.with_name(f"{model.name}.scores") / f"{words}.json"
     made_of = {"condition": condition, "captures": captures, "weights": _fingerprint_of_model(model)}
-    if file.exists():
-        kept = json.loads(file.read_text(encoding="utf-8"))
-        if kept["of"] == made_of:
-            _log.info("%s: scored before; %s", condition, file)
-            rows = {name: np.array(values) for name, values in kept["rows"].items()}
-            return CaptureScores(rows, kept["unsolved"])
+    kept = _read(file)
+    if kept.get("of") == made_of:
+        _log.info("%s: scored before; %s", condition, file)
+        return CaptureScores({n: np.array(values) for n, values in kept["rows"].items()}, kept["unsolved"])
     scores = score()
     rows = {name: values.tolist() for name, values in scores.rows.items()}
-    kept = json.dumps({"of": made_of, "unsolved": scores.unsolved, "rows": rows}, allow_nan=False)
+    text = json.dumps({"of": made_of, "unsolved": scores.unsolved, "rows": rows}, allow_nan=False)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(file) as temporary:
-            temporary.write_text(kept, encoding="utf-8")
+            temporary.write_text(text, encoding="utf-8")
     except OSError as error:
         _log.warning("%s: scores are not kept: %s", condition, error)
     return scores
@@ -56,6 +55,17 @@ def fingerprint(captures: Sequence[MultiViewBatch]) -> str:
         for array in (one.views, *one.cameras, one.joints_world, one.vertices_world):
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """Return what was kept; nothing where there is none, or where it is damaged, which is told."""
+    if not file.exists():
+        return {}
+    try:
+        return dict(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        _log.warning("%s cannot be read and is scored anew: %s", file, error)
+        return {}
 
 
 def _fingerprint_of_model(folder: Path) -> str:

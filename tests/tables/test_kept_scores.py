@@ -49,8 +49,10 @@ def test_other_weights_captures_or_conditions_are_scored_anew(tmp_path):
     kept_scores(model, "ring, 8 cameras", "d", score)
     planted_model(model, "b")
     kept_scores(model, "ring, 8 cameras", "d", score)
+    (model / "config.json").write_text('{"width": 1}')
+    kept_scores(model, "ring, 8 cameras", "d", score)
     kept_scores(planted_model(tmp_path / "v1-0", "b"), "ring, 8 cameras", "d", score)
-    assert score.calls == 5
+    assert score.calls == 6
 
 
 def test_a_model_that_cannot_be_scored_keeps_nothing(tmp_path):
@@ -62,6 +64,25 @@ def test_a_model_that_cannot_be_scored_keeps_nothing(tmp_path):
     with pytest.raises(ValueError, match="not finite"):
         kept_scores(model, "ring", "c", diverged)
     assert not list(tmp_path.rglob("*.scores/*"))
+
+
+@pytest.mark.parametrize("damage", ['{"of": {"cond', "[1, 2]", "7"])
+def test_a_damaged_file_is_told_and_scored_anew(tmp_path, caplog, damage):
+    model, score = planted_model(tmp_path / "v2-0"), Counted()
+    kept_scores(model, "ring", "c", score)
+    (file,) = tmp_path.glob("*.scores/*.json")
+    file.write_text(damage)
+    for _ in range(2):
+        assert kept_scores(model, "ring", "c", score).unsolved == 1
+    assert score.calls == 2
+    assert "cannot be read and is scored anew" in caplog.text
+
+
+def test_scores_that_cannot_be_kept_are_given_all_the_same(tmp_path, caplog):
+    model = planted_model(tmp_path / "v2-0")
+    (tmp_path / "v2-0.scores").write_text("a file where the folder should be")
+    assert kept_scores(model, "ring", "c", Counted()).unsolved == 1
+    assert "scores are not kept" in caplog.text
 
 
 def test_captures_are_known_by_images_cameras_and_labels():
