@@ -134,7 +134,9 @@ def test_one_view_is_no_sample_for_a_system_that_needs_two() -> None:
 
 def test_what_is_not_solved_or_cannot_be_read_is_counted_and_in_no_mean() -> None:
     system = Known(unsolved=frozenset({"take/000001"}))
-    scores = score_set(system, FakeFrames(length=5, damaged=frozenset({3})), QUIET)
+    heard = []
+    scores = score_set(system, FakeFrames(length=5, damaged=frozenset({3})), QUIET, heard.append)
+    assert len(heard) == 3
     assert scores.keys == ("take/000000", "take/000002", "take/000004")
     assert scores.unsolved == 1
     assert len(scores.left_out) == 1

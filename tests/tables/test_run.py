@@ -294,6 +294,20 @@ def test_robustness_tells_what_shuffled_and_foreign_cameras_cost(all_places) -> 
     assert shuffled.ours["mpvpe_mm"] != line_of(result, "DexYCB-Mv", "POEM v1").ours["mpvpe_mm"]
 
 
+def test_key_points_of_ones_own_capture_lie_within_it(tmp_path) -> None:
+    stored = tmp_path / "data" / "keypoints" / "real_world.npz"
+    own = tmp_path / "capture" / "keypoints.npz"
+    for file in (stored, own):
+        file.parent.mkdir(parents=True)
+        np.savez(file, keys=np.array(["a"]), keypoints_px=np.zeros((1, 2, 21, 2)))
+    fitting = table_named("real-world").rows[0].system
+    places = Places(tmp_path / "data")
+    assert run_module._Opened(places).keypoints(fitting) == stored
+    assert run_module._Opened(replace(places, own_capture=own.parent)).keypoints(fitting) == own
+    own.unlink()
+    assert run_module._Opened(replace(places, own_capture=own.parent)).keypoints(fitting) is None
+
+
 @pytest.mark.slow
 def test_real_world_compares_a_fit_to_key_points_with_networks(all_places) -> None:
     source = table_named("real-world").rows[0].data.open(all_places).source
