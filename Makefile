@@ -8,6 +8,8 @@ MINUTES ?= 10
 TABLE_SYSTEMS := v2 mvp v1 v2-row-major v1-wo-proj v1-1stage v1-g-emb v1-gv-emb ftl-meshtr pe-meshtr v1-wo-pt
 # Two workers: most of the suite is compiling, which keeps one core busy each.
 PYTEST := $(BIN)/python -m pytest -n 2
+# The files with tests of a marker: to collect all others takes a third of a minute a worker.
+files_with = $(shell grep -rlw "mark\.$(1)" tests --include="test_*.py")
 
 .PHONY: setup demo test test-browser test-parity test-slow lint bench accelerator synthetic-table lock clean
 .DEFAULT_GOAL := help
@@ -41,10 +43,10 @@ test-browser: setup
 
 # Programs are compiled here as users' are; in the other suites LLVM optimises nothing.
 test-parity: setup
-	XLA_FLAGS=--xla_force_host_platform_device_count=2 $(PYTEST) -m parity --dist loadfile --no-loadscope-reorder
+	XLA_FLAGS=--xla_force_host_platform_device_count=2 $(PYTEST) -m parity --dist loadfile --no-loadscope-reorder $(call files_with,parity)
 
 test-slow: setup
-	$(PYTEST) -m slow --dist worksteal
+	$(PYTEST) -m slow --dist worksteal $(call files_with,slow)
 
 lint: setup
 	$(BIN)/ruff check .

@@ -5,6 +5,7 @@ import importlib.util
 import os
 import shutil
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,6 +60,9 @@ _LONGEST = (
     "test_v1_import.py",
     "test_every_preset_learns.py",
     "test_hosts.py",
+    "test_shipped_model.py",
+    "test_wheel.py",
+    "test_accelerator.py",
 )
 """Minutes each."""
 
@@ -67,6 +71,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that take longest, so that no worker is left alone with one."""
     places = {name: place for place, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: places.get(item.path.name, len(places)))
+
+
+_END = float(os.environ.get("POEM_TESTS_END", "inf"))
+"""When no test may begin any more (seconds since 1970): what is run within a limit of time sets it."""
+
+
+def pytest_runtest_setup() -> None:
+    """Skip what would begin too late; in the report it is told apart from what has passed."""
+    if time.time() > _END:
+        pytest.skip("the time given to the tests is over (POEM_TESTS_END)")
 
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

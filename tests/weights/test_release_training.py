@@ -182,7 +182,7 @@ def check_total_norm(key: str) -> None:
 def check_clipped_norm(key: str) -> None:
     """Clip as the release does, each tensor on its own."""
     gradients = step(train=False).gradients
-    clipped, _ = clip_each_tensor(1.0).update(gradients, optax.EmptyState())
+    clipped, _ = jax.jit(clip_each_tensor(1.0).update)(gradients, optax.EmptyState())
     close(total_norm(clipped), stored()[key], rtol=1e-3)
 
 
@@ -192,7 +192,7 @@ def check_large_gradients(key: str) -> None:
 
 
 def total_norm(gradients: dict[str, Array]) -> float:
-    return float(optax.tree.norm(gradients))
+    return float(np.sqrt(sum(np.sum(np.square(gradient)) for gradient in gradients.values())))
 
 
 def check_gradient(key: str) -> None:
