@@ -9,7 +9,7 @@ TABLE_SYSTEMS := v2 mvp v1 v2-row-major v1-wo-proj v1-1stage v1-g-emb v1-gv-emb 
 # Two workers: most of the suite is compiling, which keeps one core busy each.
 PYTEST := $(BIN)/python -m pytest -n 2
 # The files with tests of a marker: to collect all others takes a third of a minute a worker.
-files_with = $(shell grep -rlw "mark\.$(1)" tests --include="test_*.py")
+files_with = $(sort $(shell grep -rlw --include="test_*.py" "mark\.$(1)" tests))
 
 .PHONY: setup demo test test-browser test-parity test-slow lint bench accelerator synthetic-table lock clean
 .DEFAULT_GOAL := help
@@ -46,7 +46,7 @@ test-parity: setup
 	XLA_FLAGS=--xla_force_host_platform_device_count=2 $(PYTEST) -m parity --dist loadfile --no-loadscope-reorder $(call files_with,parity)
 
 test-slow: setup
-	$(PYTEST) -m slow --dist worksteal $(call files_with,slow)
+	$(PYTEST) -m slow -rs --dist worksteal $(call files_with,slow)
 
 lint: setup
 	$(BIN)/ruff check .

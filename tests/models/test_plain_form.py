@@ -237,7 +237,7 @@ def test_joint_decoder(plain_form, joints_config, make_params, make_scene):
     assert apart.max() < LARGEST_M
 
 
-@pytest.mark.slow
+@pytest.mark.parity
 @pytest.mark.parametrize("like", [lambda micro: micro, _like_release], ids=["paper", "release"])
 def test_float32_is_off_by_rounding(plain_form, micro_config, make_params, make_scene, like):
     """Against the plain form's own geometry; a rounding may choose other neighbours for single queries."""
