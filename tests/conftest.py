@@ -8,6 +8,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 # Two host devices let the tests of data-parallel training run on a CPU; JAX reads this when it starts. Most
 # of the suite is compiling, so LLVM optimises nothing, and gets XLA's older and shorter code of fusions: a
@@ -75,12 +76,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 _END = float(os.environ.get("POEM_TESTS_END", "inf"))
 """When no test may begin any more (seconds since 1970): what is run within a limit of time sets it."""
+_TOO_LATE = "the time given to the tests is over (POEM_TESTS_END)"
+_MAX_TOO_LATE = 12
+"""A run that leaves out more has not tested enough, and fails."""
+_too_late: list[str] = []
 
 
 def pytest_runtest_setup() -> None:
     """Skip what would begin too late; in the report it is told apart from what has passed."""
     if time.time() > _END:
-        pytest.skip("the time given to the tests is over (POEM_TESTS_END)")
+        pytest.skip(_TOO_LATE)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    if report.skipped and _TOO_LATE in str(report.longrepr):
+        _too_late.append(report.nodeid)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if len(_too_late) > _MAX_TOO_LATE and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    if _too_late:
+        terminalreporter.write_line(f"{len(_too_late)} begun too late and not run (at most {_MAX_TOO_LATE})")
 
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -262,9 +262,11 @@ def test_apply_is_its_halves_but_for_ties(case: Case) -> None:
     assert_only_ties(run)
     seen = batch.cameras.view_mask
     close(run.prediction.keypoints_px[seen], whole.keypoints_px[seen], KEYPOINT_PX)
-    # Both lie this near the stored run, so they may lie twice as far from each other.
-    close(run.prediction.layers_world[:, 0], case.stored["all_coords_preds"][:, 0], FIRST_BLOCK_M)
-    close(run.prediction.layers_world[:, 0], whole.layers_world[:, 0], 2 * FIRST_BLOCK_M)
+    # Both lie this near the stored run, so single ones may lie up to twice as far from each other.
+    first, first_of_whole = run.prediction.layers_world[:, 0], whole.layers_world[:, 0]
+    close(first, case.stored["all_coords_preds"][:, 0], FIRST_BLOCK_M)
+    close(first, first_of_whole, 2 * FIRST_BLOCK_M)
+    assert np.mean(np.abs(first - first_of_whole) <= FIRST_BLOCK_M) >= 0.999
     for block in (1, 2):
         gap = np.linalg.norm(run.prediction.layers_world[:, block] - whole.layers_world[:, block], axis=-1)
         assert_points_agree(gap, limit_m(case.model, block))
