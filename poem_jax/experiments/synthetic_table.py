@@ -34,6 +34,7 @@ from poem_jax.training.recipes import recipe_of
 
 def _experiment(name: str, model: ModelConfig) -> TrainConfig:
     recipe = recipe_of(model)
+    has_query_vectors = name not in ("v1-g-emb", "mvp")
     return TrainConfig(
         name=f"synthetic_table_{name}",
         model=model,
@@ -46,7 +47,7 @@ def _experiment(name: str, model: ModelConfig) -> TrainConfig:
         frozen_first_stage=True,
         training_root=recipe.training_root,
         optimizer=OptimizerConfig(
-            learning_rate=4e-4,
+            learning_rate=1e-3,
             warmup_steps=100,
             schedule=Schedule.COSINE,
             final_ratio=0.01,
@@ -55,12 +56,13 @@ def _experiment(name: str, model: ModelConfig) -> TrainConfig:
             ema_decay=0.99,
         ),
         train=RunConfig(
-            steps=2000,
+            steps=2500,
             out=f"runs/synthetic_table_{name}",
             first_stage_from="shipped",
+            smooth_queries=has_query_vectors,
             checkpoint_every=200,
             keep_checkpoints=1,
-            host_devices=2,
+            host_devices=1,
         ),
     )
 

@@ -19,7 +19,7 @@ from poem_jax.geometry.transforms import matmul, rotate_points, transpose
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, ROOT_JOINT
 from poem_jax.models.config import DecoderConfig, DecoderOutput, Design, JointDecoderConfig, NeighbourSearch
 from poem_jax.models.hand_output import palm_frame
-from poem_jax.models.layers import DecoderRow, Exact, dropout, layer_norm, linear, normal
+from poem_jax.models.layers import DecoderRow, Exact, PerQuery, dropout, layer_norm, linear, normal
 from poem_jax.models.point_features import projected_features
 from poem_jax.models.vector_attention import (
     BracketedVectorAttention,
@@ -62,7 +62,7 @@ class Decoder(DecoderRow):
 
     def __init__(self, config: DecoderConfig, width: int, *, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.embeddings = nnx.Param(normal(rngs.params(), (NUM_QUERIES, width)))
+        self.embeddings = PerQuery(normal(rngs.params(), (NUM_QUERIES, width)))
         layer = ReleaseLayer if config.layer is Design.RELEASE else PaperLayer
         self.layers = nnx.List(
             layer(config, width, is_last=i == config.num_layers - 1, rngs=rngs)

@@ -52,6 +52,10 @@ class Exact(nnx.Param):
     coordinates or a logit. So what it gives is in float32, too."""
 
 
+class PerQuery(nnx.Param):
+    """A learned vector for each of the 799 query points, in the system's own order of them."""
+
+
 _Arrays = TypeVar("_Arrays", bound=tuple)
 
 

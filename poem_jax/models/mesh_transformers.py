@@ -63,6 +63,7 @@ from poem_jax.models.layers import (
     ConvNorm,
     Exact,
     NormMode,
+    PerQuery,
     TopDownBranch,
     linear,
     normal,
@@ -380,7 +381,7 @@ class EmbeddedQueries(nnx.Module):
     """A learned embedding of each query, `E_X` (paper, section "Learnable Query Points")."""
 
     def __init__(self, config: MeshTransformerConfig, *, rngs: nnx.Rngs) -> None:
-        self.embeddings = nnx.Param(normal(rngs.params(), (NUM_QUERIES, config.width)))
+        self.embeddings = PerQuery(normal(rngs.params(), (NUM_QUERIES, config.width)))
 
     def __call__(self, hand: HandModel) -> Queries:
         """Return the embeddings, and the middle of the cuboid."""

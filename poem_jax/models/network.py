@@ -19,7 +19,7 @@ from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.template import default_hand
 from poem_jax.models.config import Frozen, ModelConfig
-from poem_jax.models.layers import Exact, NormMode, Row, recompute
+from poem_jax.models.layers import NormMode, Row, recompute
 from poem_jax.models.systems import MODULES
 from poem_jax.models.world_frame import WorkingFrame, enter_working_frame
 from poem_jax.typing import Array, Float, Int, Num, Params, PRNGKeyArray, PyTree
@@ -287,11 +287,12 @@ def describe(config: ModelConfig) -> Params:
     return {group: _nested(flat.items()) for group, flat in states.items()}
 
 
-@functools.lru_cache(maxsize=32)
-def exact_weights(config: ModelConfig) -> frozenset[tuple[str, ...]]:
-    """Return the paths in `params["trainable"]` of the weights that are never cast."""
+@functools.lru_cache(maxsize=64)
+def weights_of_kind(config: ModelConfig, kind: type[nnx.Param]) -> frozenset[tuple[str, ...]]:
+    """Return the paths in `params["trainable"]` of one kind of weights: `Exact`, which are never cast, or
+    `PerQuery`."""
     weights = _blueprint(config).states["trainable"]
-    return frozenset(tuple(map(str, path)) for path, weight in weights.items() if isinstance(weight, Exact))
+    return frozenset(tuple(map(str, path)) for path, weight in weights.items() if isinstance(weight, kind))
 
 
 def check_params(config: ModelConfig, params: Params) -> None:

@@ -56,6 +56,7 @@ from poem_jax.models.layers import (
     Conv,
     DecoderRow,
     NormMode,
+    PerQuery,
     TopDownBranch,
     layer_norm,
     linear,
@@ -276,7 +277,7 @@ class VertexEmbedding(nnx.Module):
     """V-emb: a learned embedding of each query."""
 
     def __init__(self, config: PoemV1Config, hand: HandModel, *, rngs: nnx.Rngs) -> None:
-        self.table = nnx.Param(normal(rngs.params(), (NUM_QUERIES, config.width)))
+        self.table = PerQuery(normal(rngs.params(), (NUM_QUERIES, config.width)))
 
     def __call__(
         self, pooled: Float[Array, "batch view c"], view_mask: Bool[Array, "batch view"]
@@ -311,7 +312,7 @@ class GlobalAndVertexEmbedding(nnx.Module):
 
     def __init__(self, config: PoemV1Config, hand: HandModel, *, rngs: nnx.Rngs) -> None:
         self.to_global = linear(config.backbone.channels[-1], config.width, rngs=rngs)
-        self.table = nnx.Param(normal(rngs.params(), (NUM_QUERIES, config.width)))
+        self.table = PerQuery(normal(rngs.params(), (NUM_QUERIES, config.width)))
 
     def __call__(
         self, pooled: Float[Array, "batch view c"], view_mask: Bool[Array, "batch view"]

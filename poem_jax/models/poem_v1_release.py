@@ -38,7 +38,16 @@ from poem_jax.models.frustum import (
     sigmoid_step,
 )
 from poem_jax.models.frustum_config import Cuboid
-from poem_jax.models.layers import Conv, DecoderRow, NormMode, TopDownBranch, linear, max_pool, uniform
+from poem_jax.models.layers import (
+    Conv,
+    DecoderRow,
+    NormMode,
+    PerQuery,
+    TopDownBranch,
+    linear,
+    max_pool,
+    uniform,
+)
 from poem_jax.models.network import Constant
 from poem_jax.models.poem_v1_config import (
     BasisFeatures,
@@ -290,8 +299,8 @@ class _MixedEmbedding(nnx.Module):
         return self.out(jax.nn.relu(self.hidden(self._numbers(pooled, view_mask, start))))
 
 
-def _table(config: PoemV1Config, rngs: nnx.Rngs) -> nnx.Param:
-    return nnx.Param(uniform(rngs.params(), (NUM_QUERIES, config.width)))
+def _table(config: PoemV1Config, rngs: nnx.Rngs) -> PerQuery:
+    return PerQuery(uniform(rngs.params(), (NUM_QUERIES, config.width)))
 
 
 def _template(config: PoemV1Config, hand: HandModel) -> Constant:

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.network import exact_weights
+from poem_jax.models.layers import Exact
+from poem_jax.models.network import weights_of_kind
 from poem_jax.typing import Array, Params
 
 
@@ -27,7 +28,7 @@ def cast_weights(params: Params, config: ModelConfig, dtype: Any = jnp.bfloat16)
         config: the configuration that they were made with.
         dtype: what trunk and decoder compute in.
     """
-    exact = exact_weights(config)
+    exact = weights_of_kind(config, Exact)
 
     def cast(path: tuple[Any, ...], leaf: Array) -> Array:
         return leaf if tuple(part.key for part in path) in exact else jnp.asarray(leaf, dtype)

@@ -34,14 +34,14 @@ from poem_jax.models.poem_v1_config import (
 )
 from poem_jax.models.presets import TINY
 
-_WIDTH, _LAYERS, _BASIS, _NEIGHBOURS = 64, 2, 512, 8
+_WIDTH, _LAYERS, _HEADS, _BASIS, _NEIGHBOURS = 64, 2, 2, 512, 8
 _CUBOID = Cuboid((-0.4, -0.4, 0.4), (0.4, 0.4, 1.4))
 """Where hands are before the first camera of any of the rigs."""
 _MEAN_ROOT = (0.0, 0.0, 0.92)
 """Before the first camera of the rig that is trained on."""
 _TRUNK = TINY.backbone
 assert isinstance(_TRUNK, ResNetConfig)
-_DETR = DetrConfig(num_layers=_LAYERS, num_heads=4, ffn_width=256, dropout=0.0)
+_DETR = DetrConfig(num_layers=_LAYERS, num_heads=_HEADS, ffn_width=256, dropout=0.0)
 _FRUSTUM = FrustumConfig(8, _CUBOID.low[2], _CUBOID.high[2], DepthSteps.LINEAR)
 
 _V2 = Config(
@@ -51,7 +51,7 @@ _V2 = Config(
     backbone=_TRUNK,
     root=TINY.root,
     basis=BasisConfig(num_points=_BASIS),
-    decoder=DecoderConfig(num_layers=_LAYERS, num_neighbours=_NEIGHBOURS, ffn_expansion=2),
+    decoder=DecoderConfig(num_layers=_LAYERS, num_heads=_HEADS, num_neighbours=_NEIGHBOURS, ffn_expansion=2),
 )
 _V1 = PoemV1Config(
     image_hw=TINY.image_hw,
@@ -60,7 +60,7 @@ _V1 = PoemV1Config(
     backbone=_TRUNK,
     first_stage=TINY.root,
     basis=BallConfig(_BASIS, frustum=_FRUSTUM),
-    decoder=PointDecoderConfig(_LAYERS, _NEIGHBOURS, ffn_expansion=2),
+    decoder=PointDecoderConfig(_LAYERS, _NEIGHBOURS, _HEADS, ffn_expansion=2),
 )
 _PE_MESHTR = MeshTransformerConfig(
     fusion=PositionEmbeddedFusion(_FRUSTUM),
@@ -90,7 +90,7 @@ TABLE_MODELS: dict[str, ModelConfig] = {
         width=_WIDTH,
         backbone=_TRUNK,
         cuboid=_CUBOID,
-        decoder=MvpDecoderConfig(_LAYERS, num_heads=4, ffn_expansion=2, dropout=0.0),
+        decoder=MvpDecoderConfig(_LAYERS, num_heads=_HEADS, ffn_expansion=2, dropout=0.0),
     ),
 }
 """`v2-row-major` fuses views as the release does: it reads its samples in another order than they lie in

@@ -197,6 +197,9 @@ class RunConfig:
     package; None: random weights."""
     first_stage_from: str | None = None
     """Folder of a model, or `shipped`, whose trunk and heat maps a fresh run of another model starts from."""
+    smooth_queries: bool = False
+    """A fresh run's vectors for each query point begin alike where these are neighbours on the template
+    (`query_start.py`), and not each for itself."""
     max_minutes: float | None = None
     """Stop after this time, with a checkpoint; the same command goes on from there."""
     log_every: int = 20
@@ -343,6 +346,10 @@ class TrainConfig:
             run.init_from is None or run.first_stage_from is None,
             f"`train.init_from` has a first stage; got `train.first_stage_from` {run.first_stage_from} too",
         )
+        require(
+            run.init_from is None or not run.smooth_queries,
+            "`train.init_from` has learned its query points' vectors; turn `train.smooth_queries` off",
+        )
         self._check_frozen()
         require(
             not self.first_stage_steps or self.model.triangulates,
@@ -450,6 +457,7 @@ _LATER = {
     "frozen_views": False,
     "frozen_first_stage": False,
     "train.first_stage_from": None,
+    "train.smooth_queries": False,
     "model.joint_decoder": None,
     "model.backbone.frozen_norms": "none",
     "loss.reprojection_limit": 0.5,

@@ -15,6 +15,7 @@ from poem_jax.training.config import TrainConfig, git_commit
 from poem_jax.training.first_stage import with_first_stage
 from poem_jax.training.hosts import check_same_everywhere, count_where
 from poem_jax.training.parallel import put_everywhere
+from poem_jax.training.query_start import with_smooth_queries
 from poem_jax.training.state import TrainState, create_state
 from poem_jax.typing import Params
 from poem_jax.weights.store import SHIPPED, flatten, load
@@ -46,6 +47,8 @@ def _first_params(config: TrainConfig) -> Params:
     if run.init_from is not None:
         return load(_folder(run.init_from), expected=config.model)[1]
     params = init(config.model, key=jax.random.key(run.seed))
+    if run.smooth_queries:
+        params = with_smooth_queries(params, config.model, run.seed)
     if run.first_stage_from is None:
         return params
     return with_first_stage(params, load(_folder(run.first_stage_from))[1], run.first_stage_from)

@@ -13,8 +13,8 @@ from poem_jax.batch import Prediction
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand import default_hand
 from poem_jax.losses import RELEASE, Share, multi_view_losses
-from poem_jax.models.layers import DecoderRow, TrunkRow
-from poem_jax.models.network import describe, exact_weights, forward
+from poem_jax.models.layers import DecoderRow, Exact, TrunkRow
+from poem_jax.models.network import describe, forward, weights_of_kind
 from poem_jax.models.precision import cast_weights
 from poem_jax.models.presets import PRESETS
 from poem_jax.training.accumulation import Part, add_up, in_parts
@@ -263,7 +263,7 @@ def shapes_of(model):
 
 
 def test_exact_weights_are_those_of_norms_and_read_outs():
-    names = {".".join(path) for path in exact_weights(MICRO)}
+    names = {".".join(path) for path in weights_of_kind(MICRO, Exact)}
     assert {"heat_maps.to_logits.kernel", "decoder.layers.0.feed_forward.offset.kernel"} <= names
     assert "decoder.layers.0.norms.0.scale" in names
     assert not any("hidden" in name or name.endswith("conv.kernel") for name in names)
