@@ -4,10 +4,11 @@ No number of the paper's is of these captures; what can be compared is the order
 that stays above the mean hand with true root and rotation has not been trained far enough, and has no rank.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -29,7 +30,7 @@ from poem_jax.evaluation.systems import Network, System
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import CORNERS, FRONT, RING, TEST_FRAMES, TableRig, captures_of
-from poem_jax.tables.kept_scores import fingerprint, kept_scores
+from poem_jax.tables.kept_scores import Asked, KeptModel, fingerprint
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
@@ -41,6 +42,8 @@ SEEDS = (0, 1)
 """With which every system is trained."""
 FOLDER = "synthetic_table"
 """Below the folder of checkpoints: one for each system and seed, `v2-0`."""
+KEPT = "synthetic_scores"
+"""Beside the table: what each model came to, a file for each system and seed."""
 CAPTURES = SyntheticConfig()
 """The benchmark's, with the rigs' cameras in place of its own."""
 ERROR = "mpvpe_mm"
@@ -164,22 +167,14 @@ class SyntheticTable:
             baselines = _baselines(captures, score(fitting))
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             drawn = fingerprint(captures)
-            asked = f"{condition.title}, {samples} frames by {settings.batch_size}, seed {settings.seed}"
+            how = f"{samples} frames by {settings.batch_size}, seed {settings.seed}"
+            asked = Asked(f"{condition.title}, {how}", drawn)
             for system in TRAINED:
-                missing: list[str] = []
-                found: dict[int, CaptureScores] = {}
-                for seed in SEEDS:
-                    model = opened(system, seed)
-                    if isinstance(model, str):
-                        missing.append(model)
-                        continue
-                    folder = system.folder(places, seed)
-                    try:
-                        found[seed] = kept_scores(folder, asked, drawn, partial(score, model))
-                    except ValueError as error:  # One that diverged costs its own line alone.
-                        missing.append(f"{folder} could not be scored: {error}")
-                line = _line(condition, system.label, list(found.values()), samples, tuple(found))
-                group.append(_told(line, system, places, found)._replace(absent=tuple(missing)))
+                seeds = {
+                    seed: _of_seed(system, seed, places, Path(settings.out) / KEPT, opened, asked, score)
+                    for seed in SEEDS
+                }
+                group.append(_line_of_seeds(condition, system, seeds, samples))
             lines += ranked(group)
         return TableResult(self.name, self.title, tuple(lines), _NOTES)
 
@@ -187,13 +182,48 @@ class SyntheticTable:
 table = SyntheticTable()
 
 
-def _told(line: Line, system: Trained, places: Places, seeds: Iterable[int]) -> Line:
-    """Add what is known of a system: how its models were trained, and the paper's note."""
-    logs = {seed: training_summary(system.run(places, seed)) for seed in seeds}
-    training = "; ".join(f"{seed}: {log}" for seed, log in logs.items() if log)
-    notes = (system.note,) if system.note else ()
+class _OfSeed(NamedTuple):
+    """What is known of one trained model in one condition."""
+
+    scores: CaptureScores | None = None
+    training: str = ""
+    absent: str | None = None
+    """What of it is missing, and how to make it."""
+
+
+def _of_seed(
+    system: Trained,
+    seed: int,
+    places: Places,
+    kept_in: Path,
+    opened: Callable[[Trained, int], System | str],
+    asked: Asked,
+    score: Callable[[System], CaptureScores],
+) -> _OfSeed:
+    """Score a model, or take the scores that were kept of it; say what is missing."""
+    kept = KeptModel(kept_in / f"{system.name}-{seed}.npz", TABLE_MODELS[system.name])
+    model = opened(system, seed)
+    if isinstance(model, str):
+        earlier = kept.scores_without_model(asked)
+        if earlier is None:
+            return _OfSeed(absent=model)
+        return _OfSeed(*earlier, absent=f"{model} (its scores are those kept in {kept.file})")
+    folder, training = system.folder(places, seed), training_summary(system.run(places, seed))
+    try:
+        return _OfSeed(kept.scores(folder, training, asked, partial(score, model)), training)
+    except ValueError as error:  # One that diverged costs its own line alone.
+        return _OfSeed(absent=f"{folder} could not be scored: {error}")
+
+
+def _line_of_seeds(condition: Condition, system: Trained, seeds: Mapping[int, _OfSeed], samples: int) -> Line:
+    """Return the line of a system: what its models came to, how they were trained, and the paper's note."""
+    scored = {seed: one.scores for seed, one in seeds.items() if one.scores is not None}
+    line = _line(condition, system.label, list(scored.values()), samples, tuple(scored))
+    training = "; ".join(f"{seed}: {seeds[seed].training}" for seed in scored if seeds[seed].training)
     return line._replace(
-        what={**line.what, **({"training": training} if training else {})}, notes=(*line.notes, *notes)
+        what={**line.what, **({"training": training} if training else {})},
+        notes=(*line.notes, *((system.note,) if system.note else ())),
+        absent=tuple(one.absent for one in seeds.values() if one.absent is not None),
     )
 
 

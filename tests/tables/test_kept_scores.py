@@ -1,4 +1,5 @@
-"""Scores that are kept: taken again for the very same weights, captures and condition, and for no others."""
+"""Scores that are kept: taken again for the very same weights, captures and condition, and for no others;
+without the weights, for the same config."""
 
 from dataclasses import replace
 
@@ -6,18 +7,19 @@ import numpy as np
 import pytest
 
 from poem_jax.evaluation.captures import CaptureScores
+from poem_jax.models.presets import TINY, V2_NANO
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import FRONT, captures_of
-from poem_jax.tables.kept_scores import fingerprint, kept_scores
+from poem_jax.tables.kept_scores import Asked, KeptModel, fingerprint
 
-SCORES = CaptureScores({"mpvpe_mm": np.array([1.0, 2.5, 1 / 3]), "f_5": np.array([0.1, 0.2, 0.3])}, 1)
+SCORES = CaptureScores({"mpvpe_mm": np.array([1.0, 2.5, 1 / 3]), "f@5": np.array([0.1, 0.2, 0.3])}, 1)
+RING_8, RING_4 = Asked("ring, 8 cameras", "c"), Asked("ring, 4 cameras", "c")
 
 
 def planted_model(folder, weights="a"):
-    """Make a folder that has what a model's is known by."""
+    """Make a folder that has what a model's weights are known by."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.json").write_text("{}")
     (folder / "seal.json").write_text(weights)
     return folder
 
@@ -31,57 +33,92 @@ class Counted:
         return SCORES
 
 
-def test_the_same_is_scored_once_and_read_whole(tmp_path):
-    model, score = planted_model(tmp_path / "v2-0"), Counted()
+@pytest.fixture
+def model(tmp_path):
+    return planted_model(tmp_path / "v2-0")
+
+
+@pytest.fixture
+def kept(tmp_path):
+    return KeptModel(tmp_path / "scores" / "v2-0.npz", V2_NANO)
+
+
+def assert_the_same(scores):
+    assert scores.unsolved == SCORES.unsolved
+    assert scores.rows.keys() == SCORES.rows.keys()
+    for name, values in SCORES.rows.items():
+        np.testing.assert_array_equal(scores.rows[name], values.astype(np.float32))
+
+
+def test_the_same_is_scored_once_and_read_whole(model, kept):
+    score = Counted()
     for _ in range(3):
-        kept = kept_scores(model, "ring, 8 cameras", "c", score)
-        assert kept.unsolved == 1
-        assert kept.rows.keys() == SCORES.rows.keys()
-        for name, values in SCORES.rows.items():
-            np.testing.assert_array_equal(kept.rows[name], values)
+        assert_the_same(kept.scores(model, "", RING_8, score))
     assert score.calls == 1
 
 
-def test_other_weights_captures_or_conditions_are_scored_anew(tmp_path):
-    model, score = planted_model(tmp_path / "v2-0"), Counted()
-    kept_scores(model, "ring, 8 cameras", "c", score)
-    kept_scores(model, "ring, 4 cameras", "c", score)
-    kept_scores(model, "ring, 8 cameras", "d", score)
+def test_other_weights_captures_or_conditions_are_scored_anew(model, kept):
+    score = Counted()
+    for asked in (RING_8, RING_4, RING_8, RING_4):
+        kept.scores(model, "", asked, score)
+    assert score.calls == 2
+    kept.scores(model, "", replace(RING_8, captures="d"), score)
+    assert score.calls == 3
     planted_model(model, "b")
-    kept_scores(model, "ring, 8 cameras", "d", score)
-    (model / "config.json").write_text('{"width": 1}')
-    kept_scores(model, "ring, 8 cameras", "d", score)
-    kept_scores(planted_model(tmp_path / "v1-0", "b"), "ring, 8 cameras", "d", score)
-    assert score.calls == 6
+    for asked in (RING_8, RING_4, RING_8):
+        kept.scores(model, "", asked, score)
+    assert score.calls == 5
 
 
-def test_a_model_that_cannot_be_scored_keeps_nothing(tmp_path):
-    model = planted_model(tmp_path / "v2-0")
+def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how_it_was_trained(model, kept):
+    kept.scores(model, "2500 steps", RING_8, Counted())
+    kept.scores(model, "", RING_4, Counted())
+    for asked in (RING_8, RING_4):
+        scores, training = kept.scores_without_model(asked)
+        assert_the_same(scores)
+        assert training == "2500 steps"
+    assert kept.scores_without_model(Asked("front", "c")) is None
+    assert kept.scores_without_model(replace(RING_8, captures="d")) is None
+    assert replace(kept, config=TINY).scores_without_model(RING_8) is None
+    assert replace(kept, file=kept.file.with_name("v2-1.npz")).scores_without_model(RING_8) is None
 
+
+def test_new_weights_leave_nothing_of_the_old_ones(model, kept):
+    kept.scores(model, "2000 steps", RING_4, Counted())
+    kept.scores(planted_model(model, "b"), "", RING_8, Counted())
+    assert kept.scores_without_model(RING_4) is None
+    assert kept.scores_without_model(RING_8)[1] == ""
+
+
+def test_a_model_that_cannot_be_scored_keeps_nothing(model, kept):
     def diverged():
         raise ValueError("not finite")
 
     with pytest.raises(ValueError, match="not finite"):
-        kept_scores(model, "ring", "c", diverged)
-    assert not list(tmp_path.rglob("*.scores/*"))
+        kept.scores(model, "", RING_8, diverged)
+    assert not kept.file.exists()
 
 
-@pytest.mark.parametrize("damage", ['{"of": {"cond', "[1, 2]", "7"])
-def test_a_damaged_file_is_told_and_scored_anew(tmp_path, caplog, damage):
-    model, score = planted_model(tmp_path / "v2-0"), Counted()
-    kept_scores(model, "ring", "c", score)
-    (file,) = tmp_path.glob("*.scores/*.json")
-    file.write_text(damage)
+@pytest.mark.parametrize("damage", ["cut", "another", "text"])
+def test_a_damaged_file_is_told_and_made_anew(model, kept, caplog, damage):
+    score = Counted()
+    kept.scores(model, "", RING_8, score)
+    if damage == "cut":
+        kept.file.write_bytes(kept.file.read_bytes()[:-40])
+    elif damage == "text":
+        kept.file.write_text("scores")
+    else:
+        np.savez(kept.file, about=np.array("[1, 2]"))
+    assert kept.scores_without_model(RING_8) is None
     for _ in range(2):
-        assert kept_scores(model, "ring", "c", score).unsolved == 1
+        assert_the_same(kept.scores(model, "", RING_8, score))
     assert score.calls == 2
-    assert "cannot be read and is scored anew" in caplog.text
+    assert "cannot be read and is made anew" in caplog.text
 
 
-def test_scores_that_cannot_be_kept_are_given_all_the_same(tmp_path, caplog):
-    model = planted_model(tmp_path / "v2-0")
-    (tmp_path / "v2-0.scores").write_text("a file where the folder should be")
-    assert kept_scores(model, "ring", "c", Counted()).unsolved == 1
+def test_scores_that_cannot_be_kept_are_given_all_the_same(model, kept, caplog):
+    kept.file.parent.write_text("a file where the folder should be")
+    assert_the_same(kept.scores(model, "", RING_8, Counted()))
     assert "scores are not kept" in caplog.text
 
 

@@ -47,7 +47,7 @@ class ScoredOnce(Shifted):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """The table, and the same made again."""
+    """The table, the same made again, and once more where no checkpoint is."""
     places = Places(*(tmp_path_factory.mktemp(name) for name in ("data", "checkpoints", "runs")))
     for name in SHIFTS:
         planted_model(places.checkpoints / synthetic.FOLDER / name)
@@ -59,8 +59,10 @@ def results(tmp_path_factory):
         patch.setattr(synthetic, "load", lambda folder, expected=None: (expected, Path(folder)))
         patch.setattr(synthetic, "Network", lambda config, folder: ScoredOnce(SHIFTS[folder.name]))
         patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: Shifted(1.0))
-        settings = RunSettings(samples=3, batch_size=3, progress=False)
-        return [table_named("synthetic").run(places, settings) for _ in range(2)]
+        out = str(tmp_path_factory.mktemp("out"))
+        settings = RunSettings(out, samples=3, batch_size=3, progress=False)
+        elsewhere = replace(places, checkpoints=places.data, runs=places.data)
+        return [table_named("synthetic").run(where, settings) for where in (places, places, elsewhere)]
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +71,21 @@ def result(results):
 
 
 def test_made_again_it_is_the_same_and_scores_no_model_anew(results):
-    first, second = results
+    first, second, _ = results
     assert ScoredOnce.asked
     assert first == second
+
+
+def test_without_checkpoints_it_is_made_of_kept_scores_and_says_so(results):
+    first, _, without = results
+    for line, kept in zip(first.lines, without.lines, strict=True):
+        assert kept._replace(absent=()) == line._replace(absent=())
+    line = line_of(without, "ring, 8 cameras", "POEM v1")
+    for seed, said in enumerate(line.absent):
+        assert f"poem train synthetic_table:v1 --train.seed {seed}" in said
+        assert "its scores are those kept in" in said
+        assert f"v1-{seed}.npz" in said
+    assert "kept" not in line_of(without, "ring, 8 cameras", "MvP").absent[0]
 
 
 def test_a_model_that_diverged_costs_its_own_line_alone(result):
@@ -184,7 +198,8 @@ def test_ranks_are_by_error_and_baselines_have_none():
 
 
 def test_all_are_trained_alike():
-    """Data, budget, rates and averages; by the system are its network, losses and which root it is given."""
+    """Data, budget, rates and averages; by the system are its network, losses and which root it is given,
+    and whether it has vectors that can begin alike (`test_query_start`)."""
 
     def common(config):
         return replace(
@@ -193,7 +208,7 @@ def test_all_are_trained_alike():
             model=configs["v2"].model,
             loss=configs["v2"].loss,
             training_root=configs["v2"].training_root,
-            train=replace(config.train, out=""),
+            train=replace(config.train, out="", smooth_queries=False),
         )
 
     assert all(common(config) == common(configs["v2"]) for config in configs.values())
