@@ -18,8 +18,8 @@ table = Table(
             SHORT,
             (16.26, 7.72, 16.51, 8.08),
             Fitting(Solver.ADAM, _KEYPOINTS),
-            note="our detector, which has MediaPipe's networks, and the paper's Adam without masks, from the "
-            "pose in closed form; samples that fewer than two views show are not counted",
+            note="the paper's Adam without masks, from the pose in closed form; our detector has MediaPipe's "
+            "networks; samples that fewer than two views show are not counted",
         ),
         Row(
             "`poem fit`",
