@@ -56,7 +56,7 @@ def _experiment(name: str, model: ModelConfig) -> TrainConfig:
             ema_decay=0.99,
         ),
         train=RunConfig(
-            steps=2500,
+            steps=1000,
             out=f"runs/synthetic_table_{name}",
             first_stage_from="shipped",
             smooth_queries=has_query_vectors,
