@@ -30,7 +30,7 @@ from poem_jax.evaluation.systems import Network, System
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import CORNERS, FRONT, RING, TEST_FRAMES, TableRig, captures_of
-from poem_jax.tables.kept_scores import Asked, KeptModel, fingerprint
+from poem_jax.tables.kept_scores import Asked, KeptModel, known_by
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
@@ -166,7 +166,7 @@ class SyntheticTable:
             )
             baselines = _baselines(captures, score(fitting))
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
-            drawn = fingerprint(captures)
+            drawn = known_by(captures)
             how = f"{samples} frames by {settings.batch_size}, seed {settings.seed}"
             asked = Asked(f"{condition.title}, {how}", drawn)
             for system in TRAINED:
