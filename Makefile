@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # What `make accelerator` may take, all in all.
 MINUTES ?= 10
-TABLE_SYSTEMS := v2 v2-row-major v1 mvp v1-wo-proj v1-1stage v1-g-emb v1-gv-emb pe-meshtr ftl-meshtr v1-wo-pt
+TABLE_SYSTEMS := v2 v2-row-major v1 mvp v1-wo-proj v1-1stage v1-g-emb v1-gv-emb pe-meshtr ftl-meshtr v2-apart v1-wo-pt
 TABLE_MODELS := $(foreach seed,0 1,$(TABLE_SYSTEMS:%=checkpoints/synthetic_table/%-$(seed)))
 # Two workers: most of the suite is compiling, which keeps one core busy each.
 PYTEST := $(BIN)/python -m pytest -n 2

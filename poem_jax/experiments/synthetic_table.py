@@ -34,7 +34,7 @@ from poem_jax.training.recipes import recipe_of
 
 def _experiment(name: str, model: ModelConfig) -> TrainConfig:
     recipe = recipe_of(model)
-    has_query_vectors = name not in ("v1-g-emb", "mvp")
+    draws_together = name not in ("v1-g-emb", "v2-apart")
     return TrainConfig(
         name=f"synthetic_table_{name}",
         model=model,
@@ -59,7 +59,7 @@ def _experiment(name: str, model: ModelConfig) -> TrainConfig:
             steps=1000,
             out=f"runs/synthetic_table_{name}",
             first_stage_from="shipped",
-            smooth_queries=has_query_vectors,
+            smooth_queries=draws_together,
             checkpoint_every=200,
             keep_checkpoints=1,
             host_devices=1,

@@ -53,7 +53,8 @@ class Exact(nnx.Param):
 
 
 class PerQuery(nnx.Param):
-    """A learned vector for each of the 799 query points, in the system's own order of them."""
+    """A learned vector for each query: of the 799 points, in the system's own order of them, or of the 21
+    joints."""
 
 
 _Arrays = TypeVar("_Arrays", bound=tuple)

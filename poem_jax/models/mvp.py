@@ -81,6 +81,7 @@ from poem_jax.models.layers import (
     DecoderRow,
     Exact,
     NormMode,
+    PerQuery,
     dropout,
     layer_norm,
     linear,
@@ -286,7 +287,7 @@ class _JointQueries(nnx.Module):
 
     def __init__(self, config: MvpConfig, *, rngs: nnx.Rngs) -> None:
         width = config.width
-        self.table = nnx.Param(normal(rngs.params(), (NUM_JOINTS, 2 * width)))
+        self.table = PerQuery(normal(rngs.params(), (NUM_JOINTS, 2 * width)))
         self.mix = linear(config.num_views * NUM_LEVELS * width, width, rngs=rngs)
         self.locate = linear(width, 3, exact=True, rngs=rngs)
 

@@ -84,6 +84,12 @@ _ON_OAKINK = "the paper has it on OakInk-Mv alone, MPVPE {} mm beside 6.20 of PO
 TRAINED = (
     Trained("v2", "POEM v2", 6.80),
     Trained(
+        "v2-apart",
+        "POEM v2, query vectors drawn apart",
+        note="each for itself; those of all others that have any begin as sines of the template, alike where "
+        "queries are neighbours",
+    ),
+    Trained(
         "v2-row-major",
         "POEM v2, row-major fusion",
         note="fuses views as the release does, which mixes views, channels and points; not in the paper",

@@ -74,6 +74,7 @@ _PE_MESHTR = MeshTransformerConfig(
 
 TABLE_MODELS: dict[str, ModelConfig] = {
     "v2": _V2,
+    "v2-apart": _V2,
     "v2-row-major": replace(_V2, aggregation=AggregationConfig(design=Design.RELEASE)),
     "v1": _V1,
     "v1-1stage": replace(_V1, first_stage=OneStageConfig(_MEAN_ROOT), space=_CUBOID),
@@ -93,5 +94,6 @@ TABLE_MODELS: dict[str, ModelConfig] = {
         decoder=MvpDecoderConfig(_LAYERS, num_heads=_HEADS, ffn_expansion=2, dropout=0.0),
     ),
 }
-"""`v2-row-major` fuses views as the release does: it reads its samples in another order than they lie in
-memory, which mixes them (`AggregationConfig.design`)."""
+"""`v2-apart` begins with query vectors drawn each for itself (`RunConfig.smooth_queries`). `v2-row-major` fuses
+views as the release does: it reads its samples in another order than they lie in memory, which mixes them
+(`AggregationConfig.design`)."""

@@ -78,6 +78,7 @@ def smoke(config: TrainConfig, folder: Path) -> TrainConfig:
             out=str(folder / "run"),
             init_from=weights if train.init_from else None,
             first_stage_from=weights if train.first_stage_from else None,
+            smooth_queries=train.smooth_queries,
             log_every=1,
             checkpoint_every=1,
             keep_best=train.keep_best,
