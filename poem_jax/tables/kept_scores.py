@@ -18,163 +18,170 @@ import numpy as np
 
 from poem_jax.batch import MultiViewBatch
 from poem_jax.evaluation.captures import CaptureScores
-from poem_jax.hand.topology import ROOT_JOINT
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.npz_file import read_npz
 from poem_jax.models.config import ModelConfig
+from poem_jax.tables.training_summary import Training
 from poem_jax.typing import Float
-from poem_jax.weights.config_json import to_json
+from poem_jax.weights.config_json import from_json, to_json
 from poem_jax.weights.store import CHECKSUMS_FILE
 
 _log = logging.getLogger(__name__)
 _ABOUT = "about"
-_EVERY = 10
+_EVERY = 25
 """Captures of which one is looked at, to know them again."""
-_TOLERANCES = (1e-4, 1e-4, 1e-4, 0.1)
-"""Of `known_by`, metres and grey levels: machines round differently."""
+_VERTICES = slice(0, None, 97)
 
-KnownBy = Float[np.ndarray, "sample 4"]
+
+class Marks(NamedTuple):
+    """What some of the captures are known by. No checksum: the same ones differ in a last digit, or a pixel's
+    last bit, from machine to machine."""
+
+    points: Float[np.ndarray, "some point 3"]
+    """Joints and some vertices of the hands, metres."""
+    cameras: Float[np.ndarray, "some view 13"]
+    """Upper rows of each T_cam_from_world, and the focal length over the image's width."""
+    grey: Float[np.ndarray, "some view"]
+    """Mean level of each picture, 0 to 255."""
+
+    def agree(self, others: "Marks") -> bool:
+        """Say whether they are of the same captures, but for rounding: 0.1 mm, 1e-4 radians, 0.2 levels."""
+        if any(a.shape != b.shape for a, b in zip(self, others, strict=True)):
+            return False
+        close = (np.abs(a - b) < limit for a, b, limit in zip(self, others, (1e-4, 1e-4, 0.2), strict=True))
+        return all(np.all(one) for one in close)
 
 
 @dataclass(frozen=True)
-class Asked:
+class Question:
     """What scores depend on beside the model."""
 
     condition: str
     """Cameras, number of frames, and all else that can be said in words."""
-    captures: KnownBy
+    captures: Marks
 
 
-class _Condition(NamedTuple):
-    captures: KnownBy
+class _Answer(NamedTuple):
+    captures: Marks
     scores: CaptureScores
 
 
 class KeptScores(NamedTuple):
-    """Of a file."""
+    """What a file holds."""
 
     weights: str
     """Checksum of the weights' checksums."""
-    config: str
-    """Checksum of the model's config."""
-    training: str
-    conditions: dict[str, _Condition]
+    config: ModelConfig
+    training: Training
+    conditions: dict[str, _Answer]
 
-    def found(self, asked: Asked) -> CaptureScores | None:
-        """Return the scores that were asked for, if they are here."""
-        kept = self.conditions.get(asked.condition)
-        if kept is None or kept.captures.shape != asked.captures.shape:
-            return None
-        same = np.all(np.abs(kept.captures - asked.captures) < _TOLERANCES)
-        return kept.scores if same else None
+    def answer(self, question: Question) -> CaptureScores | None:
+        """Return the scores that are asked for, if they are here."""
+        kept = self.conditions.get(question.condition)
+        return kept.scores if kept is not None and kept.captures.agree(question.captures) else None
 
 
 @dataclass(frozen=True)
-class KeptModel:
-    """A model's scores and how it was trained, in one file."""
+class ScoresFile:
+    """Where a model's scores are kept."""
 
-    file: Path
+    path: Path
     config: ModelConfig
-
-    @property
-    def checksum(self) -> str:
-        """Of the config."""
-        return hashlib.sha256(to_json(self.config).encode()).hexdigest()
+    """Of the model."""
 
     def scores(
-        self, model: Path, training: str, asked: Asked, score: Callable[[], CaptureScores]
-    ) -> CaptureScores:
-        """Return what was kept of the same weights, else score and keep it.
+        self, model: Path, training: Training, question: Question, score: Callable[[], CaptureScores]
+    ) -> tuple[CaptureScores, Training]:
+        """Return what was kept of the same weights, else score and keep it; and how they were trained.
 
         Args:
             model: folder of the checkpoint.
-            training: how it was trained, in words; kept with the scores.
-            asked: captures and condition.
+            training: how it was trained, as far as that is known; kept with the scores.
+            question: captures and condition.
             score: computes them.
 
         Raises:
             ValueError: `score` cannot; nothing is kept.
         """
         weights = hashlib.sha256((model / CHECKSUMS_FILE).read_bytes()).hexdigest()
-        content = self.read()
-        if content is None or content.weights != weights:
-            content = KeptScores(weights, self.checksum, training, {})
-        kept = content.found(asked)
-        if kept is not None:
-            _log.info("%s: scored before; %s", asked.condition, self.file)
-            return kept
-        scores = _rounded(score())
-        conditions = {**content.conditions, asked.condition: _Condition(asked.captures, scores)}
-        self._write(content._replace(training=training or content.training, conditions=conditions))
-        return scores
+        kept = self.read()
+        if kept is None or (kept.weights, kept.config) != (weights, self.config):
+            kept = KeptScores(weights, self.config, training, {})
+        training = training if training.summary else kept.training
+        scores = kept.answer(question)
+        if scores is not None and training == kept.training:
+            _log.info("%s: scored before; %s", question.condition, self.path)
+            return scores, training
+        scores = _rounded(score()) if scores is None else scores
+        conditions = {**kept.conditions, question.condition: _Answer(question.captures, scores)}
+        self._write(kept._replace(training=training, conditions=conditions))
+        return scores, training
 
-    def scores_without_model(self, asked: Asked) -> tuple[CaptureScores, str] | None:
-        """Return what was kept of a model of this config whose weights are gone, and how it was trained."""
-        content = self.read()
-        if content is None or content.config != self.checksum:
+    def scores_without_model(self, question: Question) -> tuple[CaptureScores, Training] | None:
+        """Return what was kept of a model of this config whose weights are gone."""
+        kept = self.read()
+        if kept is None or kept.config != self.config:
             return None
-        kept = content.found(asked)
-        return None if kept is None else (kept, content.training)
+        scores = kept.answer(question)
+        return None if scores is None else (scores, kept.training)
 
     def read(self) -> KeptScores | None:
         """Return what was kept; None where there is nothing, or where it is damaged, which is told."""
-        if not self.file.exists():
+        if not self.path.exists():
             return None
         try:
-            arrays = read_npz(self.file, required=[_ABOUT])
+            arrays = read_npz(self.path, required=[_ABOUT])
             about = json.loads(str(arrays[_ABOUT]))
             conditions = {
-                name: _Condition(
-                    np.array(said["captures"]),
+                name: _Answer(
+                    Marks(*(arrays[f"{name}/{mark}"] for mark in Marks._fields)),
                     CaptureScores(
-                        {metric: arrays[f"{name}/{metric}"].astype(np.float64) for metric in said["metrics"]},
+                        dict(zip(said["metrics"], arrays[f"{name}/scores"].astype(np.float64), strict=True)),
                         said["unsolved"],
                     ),
                 )
                 for name, said in about["conditions"].items()
             }
-            return KeptScores(about["weights"], about["config"], about["training"], conditions)
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            _log.warning("%s cannot be read and is made anew: %s", self.file, error)
+            training = Training(*about["training"])
+            return KeptScores(about["weights"], from_json(about["config"]), training, conditions)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            _log.warning("%s cannot be read, and its scores are made anew: %s", self.path, error)
             return None
 
-    def _write(self, content: KeptScores) -> None:
+    def _write(self, kept: KeptScores) -> None:
         arrays, said = {}, {}
-        for name, (captures, scores) in content.conditions.items():
-            said[name] = {
-                "captures": np.round(captures, 5).tolist(),
-                "metrics": list(scores.rows),
-                "unsolved": scores.unsolved,
-            }
-            for metric, values in scores.rows.items():
-                arrays[f"{name}/{metric}"] = values.astype(_half_if_it_holds(values))
-        arrays[_ABOUT] = np.array(json.dumps({**content._asdict(), "conditions": said}))
+        for name, (captures, scores) in kept.conditions.items():
+            said[name] = {"metrics": list(scores.rows), "unsolved": scores.unsolved}
+            arrays |= {f"{name}/{mark}": values for mark, values in captures._asdict().items()}
+            arrays[f"{name}/scores"] = _narrowed(np.stack(list(scores.rows.values())))
+        about = {**kept._asdict(), "config": to_json(kept.config), "conditions": said}
+        arrays[_ABOUT] = np.array(json.dumps(about))
         try:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(self.file) as temporary, temporary.open("wb") as file:
+            if self.path.exists() and self.read() is None:
+                self.path.replace(self.path.with_suffix(".damaged"))
+            with whole_file(self.path) as temporary, temporary.open("wb") as file:
                 np.savez_compressed(file, **arrays)
         except OSError as error:
-            _log.warning("%s: scores are not kept: %s", self.file, error)
+            _log.warning("%s: scores are not kept: %s", self.path, error)
 
 
-def known_by(captures: Sequence[MultiViewBatch]) -> KnownBy:
-    """Return the root joint, metres, and the mean grey level of every tenth capture.
-
-    No checksum: the same captures differ in a last digit or a pixel's last bit from machine to machine.
-    """
-    return np.array([(*one.joints_world[ROOT_JOINT], np.mean(one.views)) for one in captures[::_EVERY]])
+def marks_of(captures: Sequence[MultiViewBatch]) -> Marks:
+    """Look at every 25th capture."""
+    some = captures[::_EVERY]
+    K, T_cam_from_world = (np.stack([one.cameras[i] for one in some]).astype(np.float64) for i in (0, 1))
+    width = some[0].views.shape[-2]
+    numbers = (T_cam_from_world[..., :3, :].reshape(*K.shape[:2], 12), K[..., 0, :1] / width)
+    points = [np.concatenate([one.joints_world, one.vertices_world[_VERTICES]]) for one in some]
+    grey = [np.mean(one.views, (1, 2, 3)) for one in some]
+    return Marks(*(np.asarray(x, np.float32) for x in (points, np.concatenate(numbers, -1), grey)))
 
 
 def _rounded(scores: CaptureScores) -> CaptureScores:
     """Return scores as they are kept, so that a table is the same when it is made again."""
-    rows = {
-        name: values.astype(_half_if_it_holds(values)).astype(np.float64)
-        for name, values in scores.rows.items()
-    }
-    return scores._replace(rows=rows)
+    kept = _narrowed(np.stack(list(scores.rows.values()))).astype(np.float64)
+    return scores._replace(rows=dict(zip(scores.rows, kept, strict=True)))
 
 
-def _half_if_it_holds(values: Float[np.ndarray, " sample"]) -> np.dtype:
-    """Return half numbers, or where one is beyond them (65 m), double ones."""
-    fits = bool(np.all(np.abs(values) < np.finfo(np.float16).max))
-    return np.dtype(np.float16 if fits else np.float64)
+def _narrowed(values: Float[np.ndarray, "metric sample"]) -> Float[np.ndarray, "metric sample"]:
+    """Return half numbers, or where one is beyond them (65 m), as it is."""
+    return values.astype(np.float16) if np.all(np.abs(values) < np.finfo(np.float16).max) else values

@@ -30,12 +30,12 @@ from poem_jax.evaluation.systems import Network, System
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import CORNERS, FRONT, RING, TEST_FRAMES, TableRig, captures_of
-from poem_jax.tables.kept_scores import Asked, KeptModel, known_by
+from poem_jax.tables.kept_scores import Question, ScoresFile, marks_of
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
 from poem_jax.tables.synthetic_models import TABLE_MODELS
-from poem_jax.tables.training_summary import training_summary
+from poem_jax.tables.training_summary import Training, training_of
 from poem_jax.weights.store import SHIPPED, load
 
 SEEDS = (0, 1)
@@ -139,6 +139,10 @@ _NOTES = (
     f"All systems are trained on captures of the rig `{RING.name}` alone; on `{FRONT.name}` and "
     f"`{CORNERS.name}` no camera stands where one stood in training. Trunk and heat maps are the shipped "
     "model's, for all, and stay as they are: they have seen random cameras.",
+    "The recipe (rate, heads, steps, how query vectors begin) was chosen by looks at the training error of "
+    "POEM v2 and v1, and of no other system: docs/tables.md. Query vectors begin as sines of the template, "
+    "which is not the paper's; one row begins without.",
+    "Seeds are of the first weights alone: all systems and seeds see the same captures. "
     "± is the standard error over frames of the mean over seeds; what each seed gives stands below. The "
     "paper's rank is by MPVPE on DexYCB-Mv with 8 cameras, of the systems that it has there; its v2 was "
     "trained on six sets with cameras in random order, the others on DexYCB-Mv alone.",
@@ -172,12 +176,12 @@ class SyntheticTable:
             )
             baselines = _baselines(captures, score(fitting))
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
-            drawn = known_by(captures)
-            how = f"{samples} frames by {settings.batch_size}, seed {settings.seed}"
-            asked = Asked(f"{condition.title}, {how}", drawn)
+            # A change of the cameras is drawn for a batch.
+            how = "" if condition.change is None else f" by {settings.batch_size}, seed {settings.seed}"
+            question = Question(f"{condition.title}, {samples} frames{how}", marks_of(captures))
             for system in TRAINED:
                 seeds = {
-                    seed: _of_seed(system, seed, places, Path(settings.out) / KEPT, opened, asked, score)
+                    seed: _result(system, seed, places, Path(settings.out) / KEPT, opened, question, score)
                     for seed in SEEDS
                 }
                 group.append(_line_of_seeds(condition, system, seeds, samples))
@@ -188,48 +192,53 @@ class SyntheticTable:
 table = SyntheticTable()
 
 
-class _OfSeed(NamedTuple):
+class _SeedResult(NamedTuple):
     """What is known of one trained model in one condition."""
 
     scores: CaptureScores | None = None
-    training: str = ""
+    training: Training = Training()
     absent: str | None = None
     """What of it is missing, and how to make it."""
 
 
-def _of_seed(
+def _result(
     system: Trained,
     seed: int,
     places: Places,
     kept_in: Path,
     opened: Callable[[Trained, int], System | str],
-    asked: Asked,
+    question: Question,
     score: Callable[[System], CaptureScores],
-) -> _OfSeed:
+) -> _SeedResult:
     """Score a model, or take the scores that were kept of it; say what is missing."""
-    kept = KeptModel(kept_in / f"{system.name}-{seed}.npz", TABLE_MODELS[system.name])
+    kept = ScoresFile(kept_in / f"{system.name}-{seed}.npz", TABLE_MODELS[system.name])
     model = opened(system, seed)
     if isinstance(model, str):
-        earlier = kept.scores_without_model(asked)
-        if earlier is None:
-            return _OfSeed(absent=model)
-        return _OfSeed(*earlier, absent=f"{model} (its scores are those kept in {kept.file})")
-    folder, training = system.folder(places, seed), training_summary(system.run(places, seed))
+        earlier = kept.scores_without_model(question)
+        return _SeedResult(absent=model) if earlier is None else _SeedResult(*earlier, absent=model)
+    folder, training = system.folder(places, seed), training_of(system.run(places, seed))
     try:
-        return _OfSeed(kept.scores(folder, training, asked, partial(score, model)), training)
+        return _SeedResult(*kept.scores(folder, training, question, partial(score, model)))
     except ValueError as error:  # One that diverged costs its own line alone.
-        return _OfSeed(absent=f"{folder} could not be scored: {error}")
+        return _SeedResult(absent=f"{folder} could not be scored: {error}")
 
 
-def _line_of_seeds(condition: Condition, system: Trained, seeds: Mapping[int, _OfSeed], samples: int) -> Line:
+def _line_of_seeds(
+    condition: Condition, system: Trained, seeds: Mapping[int, _SeedResult], samples: int
+) -> Line:
     """Return the line of a system: what its models came to, how they were trained, and the paper's note."""
     scored = {seed: one.scores for seed, one in seeds.items() if one.scores is not None}
     line = _line(condition, system.label, list(scored.values()), samples, tuple(scored))
-    training = "; ".join(f"{seed}: {seeds[seed].training}" for seed in scored if seeds[seed].training)
+    said = {
+        "training": "; ".join(
+            f"{s}: {seeds[s].training.summary}" for s in scored if seeds[s].training.summary
+        ),
+        "of kept scores": "; ".join(f"{s}: {seeds[s].absent}" for s in scored if seeds[s].absent is not None),
+    }
     return line._replace(
-        what={**line.what, **({"training": training} if training else {})},
+        what={**line.what, **{key: words for key, words in said.items() if words}},
         notes=(*line.notes, *((system.note,) if system.note else ())),
-        absent=tuple(one.absent for one in seeds.values() if one.absent is not None),
+        absent=tuple(one.absent for one in seeds.values() if one.scores is None and one.absent is not None),
     )
 
 

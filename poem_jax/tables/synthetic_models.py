@@ -94,6 +94,6 @@ TABLE_MODELS: dict[str, ModelConfig] = {
         decoder=MvpDecoderConfig(_LAYERS, num_heads=_HEADS, ffn_expansion=2, dropout=0.0),
     ),
 }
-"""`v2-apart` begins with query vectors drawn each for itself (`RunConfig.smooth_queries`). `v2-row-major` fuses
-views as the release does: it reads its samples in another order than they lie in memory, which mixes them
-(`AggregationConfig.design`)."""
+"""`v2-apart` begins with query vectors drawn each for itself (`RunConfig.smooth_queries`). `v2-row-major`
+fuses views as the release does: it reads its samples in another order than they lie in memory, which mixes
+them (`AggregationConfig.design`)."""

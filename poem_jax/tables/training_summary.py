@@ -1,20 +1,33 @@
-"""What a training log comes to, in one line."""
+"""How a model was trained: its run's config, and what the log comes to in one line."""
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-_METRICS = "metrics.jsonl"
-"""As `poem train` writes it."""
+_METRICS, _CONFIG = "metrics.jsonl", "train_config.json"
+"""As `poem train` writes them."""
 
 
-def training_summary(run: Path) -> str:
-    """Return steps, errors on the first and the last training samples and hours; "" where there is no log.
+class Training(NamedTuple):
+    """How a model was trained, as far as that is known."""
+
+    summary: str = ""
+    """Steps, errors on the first and the last training samples, and hours."""
+    config: str = ""
+    """The run's config file: every field by its dotted name."""
+
+
+def training_of(run: Path) -> Training:
+    """Read the folder of a run; nothing where there is none.
 
     Args:
         run: folder of `poem train`. Steps that were taken again after a stop count once, in hours as well.
     """
-    file = run / _METRICS
+    config = run / _CONFIG
+    return Training(_summary(run / _METRICS), config.read_text(encoding="utf-8") if config.is_file() else "")
+
+
+def _summary(file: Path) -> str:
     if not file.is_file():
         return ""
     lines = map(_entry, file.read_text(encoding="utf-8").splitlines())

@@ -11,19 +11,30 @@ from poem_jax.models.presets import TINY, V2_NANO
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import FRONT, captures_of
-from poem_jax.tables.kept_scores import Asked, KeptModel, known_by
+from poem_jax.tables.kept_scores import Question, ScoresFile, marks_of
+from poem_jax.tables.training_summary import Training
 
-SCORES = CaptureScores(
-    {
-        "mpvpe_mm": np.array([21.0, 2.5, 1 / 3]),
-        "f_5": np.array([0.1, 0.2, 0.3]),
-        "far": np.array([7e4, 1, 2]),
-    },
-    1,
-)
-CAPTURES = np.array([[0.1, -0.05, 0.02, 101.5], [0.0, 0.01, 0.3, 87.25]])
-RING_8, RING_4 = (Asked(f"ring, {cameras} cameras", CAPTURES) for cameras in (8, 4))
-OTHERS = replace(RING_8, captures=CAPTURES + np.array([2e-4, 0, 0, 0]))
+SCORES = CaptureScores({"mpvpe_mm": np.array([21.0, 2.5, 1 / 3]), "f_5": np.array([0.1, 0.2, 0.3])}, 1)
+FAR = CaptureScores({"mpvpe_mm": np.array([7e4, 2.5, 1 / 3])}, 0)
+TRAINED = Training("1000 steps", "{}")
+UNKNOWN = Training()
+
+
+def some_captures(rig=FRONT):
+    small = replace(SyntheticConfig(), image_hw=(16, 16), supersample=1, num_backgrounds=2)
+    dataset = SyntheticDataset(captures_of(rig, small), seed=1)
+    return [dataset.sample(index, num_views=2) for index in range(26)]
+
+
+@pytest.fixture(scope="module")
+def captures():
+    return some_captures()
+
+
+@pytest.fixture(scope="module")
+def ring(captures):
+    """Two questions of the same captures."""
+    return [Question(f"ring, {cameras} cameras", marks_of(captures)) for cameras in (8, 4)]
 
 
 def planted_model(folder, weights="a"):
@@ -34,12 +45,12 @@ def planted_model(folder, weights="a"):
 
 
 class Counted:
-    def __init__(self):
-        self.calls = 0
+    def __init__(self, scores=SCORES):
+        self.scores, self.calls = scores, 0
 
     def __call__(self):
         self.calls += 1
-        return SCORES
+        return self.scores
 
 
 @pytest.fixture
@@ -48,115 +59,143 @@ def model(tmp_path):
 
 
 @pytest.fixture
-def kept(tmp_path):
-    return KeptModel(tmp_path / "scores" / "v2-0.npz", V2_NANO)
+def file(tmp_path):
+    return ScoresFile(tmp_path / "scores" / "v2-0.npz", V2_NANO)
 
 
-def assert_the_same(scores):
-    assert scores.unsolved == SCORES.unsolved
-    assert scores.rows.keys() == SCORES.rows.keys()
-    for name, values in SCORES.rows.items():
+def assert_close(scores, expected=SCORES):
+    assert scores.unsolved == expected.unsolved
+    assert list(scores.rows) == list(expected.rows)
+    for name, values in expected.rows.items():
         np.testing.assert_allclose(scores.rows[name], values, rtol=5e-4)
 
 
-def test_the_same_is_scored_once_and_read_whole(model, kept):
-    score = Counted()
-    first, *others = (kept.scores(model, "", RING_8, score) for _ in range(3))
-    assert_the_same(first)
+@pytest.mark.parametrize("expected", [SCORES, FAR])
+def test_the_same_is_scored_once_and_read_whole(model, file, ring, expected):
+    score = Counted(expected)
+    first, *others = (file.scores(model, TRAINED, ring[0], score)[0] for _ in range(3))
+    assert_close(first, expected)
     for other in others:
         for name, values in first.rows.items():
             np.testing.assert_array_equal(other.rows[name], values)
     assert score.calls == 1
 
 
-def test_other_weights_captures_or_conditions_are_scored_anew(model, kept):
+def test_other_weights_configs_or_conditions_are_scored_anew(model, file, ring):
     score = Counted()
-    for asked in (RING_8, RING_4, RING_8, RING_4):
-        kept.scores(model, "", asked, score)
+    for question in (*ring, *ring):
+        file.scores(model, TRAINED, question, score)
     assert score.calls == 2
-    kept.scores(model, "", OTHERS, score)
-    assert score.calls == 3
     planted_model(model, "b")
-    for asked in (RING_8, RING_4, RING_8):
-        kept.scores(model, "", asked, score)
+    for question in (*ring, *ring):
+        file.scores(model, TRAINED, question, score)
+    assert score.calls == 4
+    other = replace(file, config=TINY)
+    other.scores(model, TRAINED, ring[0], score)
     assert score.calls == 5
+    assert other.scores_without_model(ring[0]) is not None
+    assert file.scores_without_model(ring[0]) is None
 
 
-def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how_it_was_trained(model, kept):
-    kept.scores(model, "2500 steps", RING_8, Counted())
-    kept.scores(model, "", RING_4, Counted())
-    for asked in (RING_8, RING_4):
-        scores, training = kept.scores_without_model(asked)
-        assert_the_same(scores)
-        assert training == "2500 steps"
-    assert kept.scores_without_model(Asked("front", CAPTURES)) is None
-    assert kept.scores_without_model(OTHERS) is None
-    assert replace(kept, config=TINY).scores_without_model(RING_8) is None
-    assert replace(kept, file=kept.file.with_name("v2-1.npz")).scores_without_model(RING_8) is None
+def _moved_camera(one):
+    T = np.array(one.cameras.T_cam_from_world)
+    T[1, 0, 3] += 5e-4
+    return one._replace(cameras=one.cameras._replace(T_cam_from_world=T))
 
 
-def test_new_weights_leave_nothing_of_the_old_ones(model, kept):
-    kept.scores(model, "2000 steps", RING_4, Counted())
-    kept.scores(planted_model(model, "b"), "", RING_8, Counted())
-    assert kept.scores_without_model(RING_4) is None
-    assert kept.scores_without_model(RING_8)[1] == ""
+def _other_vertices(one):
+    vertices = np.array(one.vertices_world)
+    vertices[97] += 5e-4
+    return one._replace(vertices_world=vertices)
 
 
-def test_a_model_that_cannot_be_scored_keeps_nothing(model, kept):
+def _longer_lens(one):
+    K = np.array(one.cameras.K)
+    K[0, 0, 0] *= 1.001
+    return one._replace(cameras=one.cameras._replace(K=K))
+
+
+def _brighter_view(one):
+    views = np.array(one.views)
+    views[0] = np.minimum(views[0].astype(int) + 1, 255)
+    return one._replace(views=views)
+
+
+@pytest.mark.parametrize("change", [_moved_camera, _other_vertices, _longer_lens, _brighter_view])
+def test_other_captures_are_scored_anew(model, file, captures, change):
+    score = Counted()
+    others = [*captures[:25], change(captures[25])]
+    for some in (captures, others, captures[:25]):
+        file.scores(model, TRAINED, Question("front", marks_of(some)), score)
+    assert score.calls == 3
+
+
+def test_another_machine_that_rounds_otherwise_knows_the_captures_again(model, file, captures):
+    score = Counted()
+    rounded = [one._replace(vertices_world=one.vertices_world + 1e-6) for one in captures]
+    for some in (captures, rounded, some_captures()):
+        file.scores(model, TRAINED, Question("front", marks_of(some)), score)
+    assert score.calls == 1
+
+
+def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how_it_was_trained(
+    model, file, ring
+):
+    for question in ring:
+        file.scores(model, TRAINED, question, Counted())
+    for question in ring:
+        scores, training = file.scores_without_model(question)
+        assert_close(scores)
+        assert training == TRAINED
+    assert file.scores_without_model(replace(ring[0], condition="front")) is None
+    assert replace(file, config=TINY).scores_without_model(ring[0]) is None
+    assert replace(file, path=file.path.with_name("v2-1.npz")).scores_without_model(ring[0]) is None
+
+
+def test_how_it_was_trained_is_kept_where_the_run_is_gone_and_added_where_it_turns_up(model, file, ring):
+    assert file.scores(model, UNKNOWN, ring[0], Counted())[1] == UNKNOWN
+    assert file.scores(model, TRAINED, ring[0], Counted())[1] == TRAINED
+    for question in ring:
+        assert file.scores(model, UNKNOWN, question, Counted())[1] == TRAINED
+    assert file.read().training == TRAINED
+
+
+def test_new_weights_leave_nothing_of_the_old_ones(model, file, ring):
+    file.scores(model, TRAINED, ring[1], Counted())
+    file.scores(planted_model(model, "b"), UNKNOWN, ring[0], Counted())
+    assert file.scores_without_model(ring[1]) is None
+    assert file.scores_without_model(ring[0])[1] == UNKNOWN
+
+
+def test_a_model_that_cannot_be_scored_keeps_nothing(model, file, ring):
     def diverged():
         raise ValueError("not finite")
 
     with pytest.raises(ValueError, match="not finite"):
-        kept.scores(model, "", RING_8, diverged)
-    assert not kept.file.exists()
+        file.scores(model, TRAINED, ring[0], diverged)
+    assert not file.path.exists()
 
 
-@pytest.mark.parametrize("damage", ["cut", "another", "text"])
-def test_a_damaged_file_is_told_and_made_anew(model, kept, caplog, damage):
+@pytest.mark.parametrize("damage", ["cut", "[1, 2]", '{"conditions": []}', "text"])
+def test_a_damaged_file_is_told_put_aside_and_made_anew(model, file, ring, caplog, damage):
     score = Counted()
-    kept.scores(model, "", RING_8, score)
+    file.scores(model, TRAINED, ring[0], score)
     if damage == "cut":
-        kept.file.write_bytes(kept.file.read_bytes()[:-40])
+        file.path.write_bytes(file.path.read_bytes()[:-40])
     elif damage == "text":
-        kept.file.write_text("scores")
+        file.path.write_text("scores")
     else:
-        np.savez(kept.file, about=np.array("[1, 2]"))
-    assert kept.scores_without_model(RING_8) is None
+        np.savez(file.path, about=np.array(damage))
+    damaged = file.path.read_bytes()
+    assert file.scores_without_model(ring[0]) is None
     for _ in range(2):
-        assert_the_same(kept.scores(model, "", RING_8, score))
+        assert_close(file.scores(model, TRAINED, ring[0], score)[0])
     assert score.calls == 2
-    assert "cannot be read and is made anew" in caplog.text
+    assert "cannot be read" in caplog.text
+    assert file.path.with_suffix(".damaged").read_bytes() == damaged
 
 
-def test_scores_that_cannot_be_kept_are_given_all_the_same(model, kept, caplog):
-    kept.file.parent.write_text("a file where the folder should be")
-    assert_the_same(kept.scores(model, "", RING_8, Counted()))
+def test_scores_that_cannot_be_kept_are_given_all_the_same(model, file, ring, caplog):
+    file.path.parent.write_text("a file where the folder should be")
+    assert_close(file.scores(model, TRAINED, ring[0], Counted())[0])
     assert "scores are not kept" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("change", "same"),
-    [
-        (np.full(4, 1e-5), True),
-        (np.array([0, 2e-4, 0, 0]), False),
-        (np.array([0, 0, 0, 0.2]), False),
-        (np.full(4, np.nan), False),
-    ],
-)
-def test_captures_are_the_same_but_for_rounding(model, kept, change, same):
-    score = Counted()
-    for captures in (CAPTURES, CAPTURES + change):
-        kept.scores(model, "", Asked("ring", captures), score)
-    assert score.calls == (1 if same else 2)
-    kept.scores(model, "", Asked("ring", CAPTURES[:1]), score)
-    assert score.calls == (2 if same else 3)
-
-
-def test_captures_are_known_by_where_the_hand_is_and_how_bright_the_pictures_are():
-    small = replace(SyntheticConfig(), image_hw=(16, 16), supersample=1, num_backgrounds=2)
-    dataset = SyntheticDataset(captures_of(FRONT, small), seed=1)
-    captures = [dataset.sample(index, num_views=1) for index in range(11)]
-    known = known_by(captures)
-    assert known.shape == (2, 4)
-    for row, one in zip(known, (captures[0], captures[10]), strict=True):
-        np.testing.assert_allclose(row, [*one.joints_world[9], one.views.mean()], rtol=1e-6)

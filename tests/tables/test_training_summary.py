@@ -1,8 +1,8 @@
-"""The line that a training log comes to."""
+"""What is known of how a model was trained: the line that its log comes to, and its run's config."""
 
 import json
 
-from poem_jax.tables.training_summary import training_summary
+from poem_jax.tables.training_summary import Training, training_of
 
 
 def test_it_says_steps_errors_and_hours(tmp_path):
@@ -15,11 +15,13 @@ def test_it_says_steps_errors_and_hours(tmp_path):
     (tmp_path / "metrics.jsonl").write_text(
         "".join(json.dumps(line) + "\n" for line in lines) + '{"group": "tr'
     )
+    (tmp_path / "train_config.json").write_text('{"name": "a"}')
     # 100 steps of 2 s, and 100 of 4 s, which were taken again after a stop.
-    assert training_summary(tmp_path) == f"200 steps, training MPVPE 70 to 45.2 mm, {600 / 3600:.1f} h"
+    summary = f"200 steps, training MPVPE 70 to 45.2 mm, {600 / 3600:.1f} h"
+    assert training_of(tmp_path) == Training(summary, '{"name": "a"}')
 
 
 def test_without_a_log_it_says_nothing(tmp_path):
-    assert training_summary(tmp_path / "none") == ""
+    assert training_of(tmp_path / "none") == Training()
     (tmp_path / "metrics.jsonl").touch()
-    assert training_summary(tmp_path) == ""
+    assert training_of(tmp_path) == Training()

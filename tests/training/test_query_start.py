@@ -75,8 +75,8 @@ def test_the_seed_decides_them():
 
 
 def test_a_system_without_such_vectors_is_refused():
-    config = configs["mvp"].model
-    with pytest.raises(ValueError, match=r"smooth_queries.*MvpConfig has none"):
+    config = configs["v1-g-emb"].model
+    with pytest.raises(ValueError, match=r"smooth_queries.*PoemV1Config has none"):
         with_smooth_queries(init(config, key=jax.random.key(0)), config, seed=0)
 
 
