@@ -25,7 +25,7 @@ MAX_GROWTH, FREE_BYTES = 100, 2**26
 """Arrays may take 100 times the bytes of their file, and 64 MiB whatever it has: compression makes little of
 arrays that are all NaN, but no long take is."""
 MAX_ARRAYS = 1000
-"""Arrays in a file; ours have up to 20."""
+"""Arrays in a file; ours have up to 30."""
 MAX_CAUSE = 300
 """Characters of another library's message that are passed on."""
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

@@ -43,7 +43,8 @@ SEEDS = (0, 1)
 FOLDER = "synthetic_table"
 """Below the folder of checkpoints: one for each system and seed, `v2-0`."""
 KEPT = "synthetic_scores"
-"""Beside the table: what each model came to, a file for each system and seed."""
+"""Beside the table: what each model came to, a file for each system and seed, and one of the fit."""
+FITTED = "poem-fit.npz"
 CAPTURES = SyntheticConfig()
 """The benchmark's, with the rigs' cameras in place of its own."""
 ERROR = "mpvpe_mm"
@@ -160,7 +161,10 @@ class SyntheticTable:
         """Score every system whose checkpoints are here; say of the others how they are made."""
         samples = TEST_FRAMES if settings.samples is None else min(settings.samples, TEST_FRAMES)
         opened = cache(partial(_opened, places))
-        fitting = FirstStageFitting(*load(SHIPPED))
+        config, params = load(SHIPPED)
+        fitting = FirstStageFitting(config, params)
+        kept_in = Path(settings.out) / KEPT
+        fitted = ScoresFile(kept_in / FITTED, config)
         lines: list[Line] = []
         rig, captures = None, []
         for condition in tqdm(CONDITIONS, unit="condition", desc=self.name, disable=not settings.progress):
@@ -174,15 +178,15 @@ class SyntheticTable:
                 change=condition.change,
                 seed=settings.seed,
             )
-            baselines = _baselines(captures, score(fitting))
-            group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             # A change of the cameras is drawn for a batch.
             how = "" if condition.change is None else f" by {settings.batch_size}, seed {settings.seed}"
             question = Question(f"{condition.title}, {samples} frames{how}", marks_of(captures))
+            of_fit, _ = fitted.scores(SHIPPED, Training(), question, partial(score, fitting))
+            baselines = _baselines(captures, of_fit)
+            group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             for system in TRAINED:
                 seeds = {
-                    seed: _result(system, seed, places, Path(settings.out) / KEPT, opened, question, score)
-                    for seed in SEEDS
+                    seed: _result(system, seed, places, kept_in, opened, question, score) for seed in SEEDS
                 }
                 group.append(_line_of_seeds(condition, system, seeds, samples))
             lines += ranked(group)

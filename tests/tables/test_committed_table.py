@@ -11,6 +11,7 @@ from poem_jax.synthetic.table_rigs import TEST_FRAMES
 from poem_jax.tables.kept_scores import ScoresFile
 from poem_jax.tables.synthetic import (
     CONDITIONS,
+    FITTED,
     FITTING,
     KEPT,
     MEAN,
@@ -23,7 +24,7 @@ from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.training.config import differences, flatten_config
 
 TABLES = Path(__file__).resolve().parents[2] / "docs" / "tables"
-FILES = {file.stem: file for file in sorted((TABLES / KEPT).glob("*.npz"))}
+FILES = {file.stem: file for file in sorted((TABLES / KEPT).glob("*.npz")) if file.name != FITTED}
 TITLES = [condition.title for condition in CONDITIONS]
 
 

@@ -14,6 +14,7 @@ from poem_jax.evaluation.systems import Network
 from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.experiments.synthetic_table import configs
 from poem_jax.models.apply import init
+from poem_jax.models.presets import TINY
 from poem_jax.tables import synthetic
 from poem_jax.tables.all_tables import table_named
 from poem_jax.tables.layout import as_markdown, write_table
@@ -56,9 +57,9 @@ def results(tmp_path_factory):
     (log / "metrics.jsonl").write_text(json.dumps(LOG_LINE) + "\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "CAPTURES", SMALL)
-        patch.setattr(synthetic, "load", lambda folder, expected=None: (expected, Path(folder)))
+        patch.setattr(synthetic, "load", lambda folder, expected=TINY: (expected, Path(folder)))
         patch.setattr(synthetic, "Network", lambda config, folder: ScoredOnce(SHIFTS[folder.name]))
-        patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: Shifted(1.0))
+        patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: ScoredOnce(1.0))
         out = str(tmp_path_factory.mktemp("out"))
         settings = RunSettings(out, samples=3, batch_size=3, progress=False)
         elsewhere = replace(places, checkpoints=places.data, runs=places.data)
