@@ -2,8 +2,9 @@
 stands when their weights, which are large, are gone.
 
 A file a model: every metric of every frame, by condition, and what it was made of. It counts for the very
-same weights where these are there, else for a model of the same config; always for the same captures. Kept
-are half numbers, three digits a frame, which are what the table is made of the first time, too.
+same weights where these are there, else for a model of the same config on the same shipped first stage;
+always for the same captures. Kept are half numbers, three digits a frame, which are what the table is made of
+the first time, too.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ from poem_jax.models.config import ModelConfig
 from poem_jax.tables.training_summary import Training
 from poem_jax.typing import Float
 from poem_jax.weights.config_json import from_json, to_json
-from poem_jax.weights.store import CHECKSUMS_FILE
+from poem_jax.weights.store import CHECKSUMS_FILE, SHIPPED
 
 _log = logging.getLogger(__name__)
 _ABOUT = "about"
@@ -39,8 +40,8 @@ class Marks(NamedTuple):
 
     points: Float[np.ndarray, "some point 3"]
     """Joints and some vertices of the hands, metres."""
-    cameras: Float[np.ndarray, "some view 13"]
-    """Upper rows of each T_cam_from_world, and the focal length over the image's width."""
+    cameras: Float[np.ndarray, "some view 18"]
+    """Upper rows of each T_cam_from_world, and of each K over the image's width."""
     grey: Float[np.ndarray, "some view"]
     """Mean level of each picture, 0 to 255."""
 
@@ -71,6 +72,8 @@ class KeptScores(NamedTuple):
 
     weights: str
     """Checksum of the weights' checksums."""
+    first_stage: str
+    """The same of the shipped model, which lends its first stage."""
     config: ModelConfig
     training: Training
     conditions: dict[str, _Answer]
@@ -103,11 +106,11 @@ class ScoresFile:
         Raises:
             ValueError: `score` cannot; nothing is kept.
         """
-        weights = hashlib.sha256((model / CHECKSUMS_FILE).read_bytes()).hexdigest()
-        kept = self.read()
+        weights, kept = checksum_of(model), self.read()
         if kept is None or (kept.weights, kept.config) != (weights, self.config):
-            kept = KeptScores(weights, self.config, training, {})
-        training = training if training.summary else kept.training
+            kept = KeptScores(weights, checksum_of(SHIPPED), self.config, training, {})
+        # The run's folder may hold another run by now.
+        training = kept.training if kept.training.summary else training
         scores = kept.answer(question)
         if scores is not None and training == kept.training:
             _log.info("%s: scored before; %s", question.condition, self.path)
@@ -118,12 +121,19 @@ class ScoresFile:
         return scores, training
 
     def scores_without_model(self, question: Question) -> tuple[CaptureScores, Training] | None:
-        """Return what was kept of a model of this config whose weights are gone."""
+        """Return what was kept of a model of this config whose weights are gone; the log says what does not
+        fit."""
         kept = self.read()
-        if kept is None or kept.config != self.config:
+        if kept is None:
+            return None
+        if (kept.first_stage, kept.config) != (checksum_of(SHIPPED), self.config):
+            _log.warning("%s is of another config, or of another shipped first stage", self.path)
             return None
         scores = kept.answer(question)
-        return None if scores is None else (scores, kept.training)
+        if scores is None:
+            _log.warning("%s has no scores of these captures: %s", self.path, question.condition)
+            return None
+        return scores, kept.training
 
     def read(self) -> KeptScores | None:
         """Return what was kept; None where there is nothing, or where it is damaged, which is told."""
@@ -143,7 +153,8 @@ class ScoresFile:
                 for name, said in about["conditions"].items()
             }
             training = Training(*about["training"])
-            return KeptScores(about["weights"], from_json(about["config"]), training, conditions)
+            config = from_json(about["config"])
+            return KeptScores(about["weights"], about["first_stage"], config, training, conditions)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             _log.warning("%s cannot be read, and its scores are made anew: %s", self.path, error)
             return None
@@ -165,15 +176,22 @@ class ScoresFile:
             _log.warning("%s: scores are not kept: %s", self.path, error)
 
 
+def checksum_of(model: Path) -> str:
+    """Return a checksum of the weights in a folder, by those that they were sealed with."""
+    return hashlib.sha256((model / CHECKSUMS_FILE).read_bytes()).hexdigest()
+
+
 def marks_of(captures: Sequence[MultiViewBatch]) -> Marks:
     """Look at every 25th capture."""
     some = captures[::_EVERY]
     K, T_cam_from_world = (np.stack([one.cameras[i] for one in some]).astype(np.float64) for i in (0, 1))
     width = some[0].views.shape[-2]
-    numbers = (T_cam_from_world[..., :3, :].reshape(*K.shape[:2], 12), K[..., 0, :1] / width)
+    numbers = (
+        x[..., :rows, :].reshape(*K.shape[:2], -1) for x, rows in ((T_cam_from_world, 3), (K / width, 2))
+    )
     points = [np.concatenate([one.joints_world, one.vertices_world[_VERTICES]]) for one in some]
     grey = [np.mean(one.views, (1, 2, 3)) for one in some]
-    return Marks(*(np.asarray(x, np.float32) for x in (points, np.concatenate(numbers, -1), grey)))
+    return Marks(*(np.asarray(x, np.float32) for x in (points, np.concatenate(list(numbers), -1), grey)))
 
 
 def _rounded(scores: CaptureScores) -> CaptureScores:

@@ -127,6 +127,11 @@ class Condition:
         shuffled = "" if self.change is None else ", shuffled"
         return f"{self.rig.name}, {first}{self.num_views} cameras{shuffled}"
 
+    def in_words(self, samples: int, batch_size: int, seed: int) -> str:
+        """Say all that scores depend on; a change of the cameras is drawn for a batch."""
+        how = "" if self.change is None else f" by {batch_size}, seed {seed}"
+        return f"{self.title}, {samples} frames{how}"
+
 
 CONDITIONS = (
     Condition(RING, 8),
@@ -140,10 +145,11 @@ _NOTES = (
     f"All systems are trained on captures of the rig `{RING.name}` alone; on `{FRONT.name}` and "
     f"`{CORNERS.name}` no camera stands where one stood in training. Trunk and heat maps are the shipped "
     "model's, for all, and stay as they are: they have seen random cameras.",
-    "The recipe (rate, heads, steps, how query vectors begin) was chosen by looks at the training error of "
-    "POEM v2 and v1, and of no other system: docs/tables.md. Query vectors begin as sines of the template, "
-    "which is not the paper's; one row begins without.",
-    "Seeds are of the first weights alone: all systems and seeds see the same captures. "
+    "The recipe (rate, heads, steps, how query vectors begin) was changed after test errors of v2 and MvP "
+    "under a first one had been seen; the choices were by training errors of v2 and v1, and of no other system: "
+    "docs/tables.md. Query vectors begin as sines of the template, which is not the paper's; one row begins "
+    "without.",
+    "Seeds are of the first weights, and in v1 of the basis points that training draws, not of the captures. "
     "± is the standard error over frames of the mean over seeds; what each seed gives stands below. The "
     "paper's rank is by MPVPE on DexYCB-Mv with 8 cameras, of the systems that it has there; its v2 was "
     "trained on six sets with cameras in random order, the others on DexYCB-Mv alone.",
@@ -163,7 +169,8 @@ class SyntheticTable:
         opened = cache(partial(_opened, places))
         config, params = load(SHIPPED)
         fitting = FirstStageFitting(config, params)
-        kept_in = Path(settings.out) / KEPT
+        # A quick look leaves the scores of all frames alone.
+        kept_in = Path(settings.out) / (KEPT if samples == TEST_FRAMES else f"{KEPT}_{samples}")
         fitted = ScoresFile(kept_in / FITTED, config)
         lines: list[Line] = []
         rig, captures = None, []
@@ -178,9 +185,8 @@ class SyntheticTable:
                 change=condition.change,
                 seed=settings.seed,
             )
-            # A change of the cameras is drawn for a batch.
-            how = "" if condition.change is None else f" by {settings.batch_size}, seed {settings.seed}"
-            question = Question(f"{condition.title}, {samples} frames{how}", marks_of(captures))
+            asked = condition.in_words(samples, settings.batch_size, settings.seed)
+            question = Question(asked, marks_of(captures))
             of_fit, _ = fitted.scores(SHIPPED, Training(), question, partial(score, fitting))
             baselines = _baselines(captures, of_fit)
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
@@ -237,7 +243,9 @@ def _line_of_seeds(
         "training": "; ".join(
             f"{s}: {seeds[s].training.summary}" for s in scored if seeds[s].training.summary
         ),
-        "of kept scores": "; ".join(f"{s}: {seeds[s].absent}" for s in scored if seeds[s].absent is not None),
+        "weights gone, scores kept": "; ".join(
+            f"{s}: {seeds[s].absent}" for s in scored if seeds[s].absent is not None
+        ),
     }
     return line._replace(
         what={**line.what, **{key: words for key, words in said.items() if words}},

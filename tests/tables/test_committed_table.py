@@ -6,10 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from poem_jax.evaluation.benchmark import DEFAULT_SEED
 from poem_jax.experiments.synthetic_table import configs
-from poem_jax.synthetic.table_rigs import TEST_FRAMES
-from poem_jax.tables.kept_scores import ScoresFile
+from poem_jax.models.presets import TINY
+from poem_jax.synthetic.dataset import SyntheticDataset
+from poem_jax.synthetic.table_rigs import TABLE_RIGS, TEST_FRAMES, captures_of
+from poem_jax.tables.kept_scores import Marks, ScoresFile, checksum_of, marks_of
+from poem_jax.tables.result import RunSettings
 from poem_jax.tables.synthetic import (
+    CAPTURES,
     CONDITIONS,
     FITTED,
     FITTING,
@@ -22,6 +27,7 @@ from poem_jax.tables.synthetic import (
 )
 from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.training.config import differences, flatten_config
+from poem_jax.weights.store import SHIPPED
 
 TABLES = Path(__file__).resolve().parents[2] / "docs" / "tables"
 FILES = {file.stem: file for file in sorted((TABLES / KEPT).glob("*.npz")) if file.name != FITTED}
@@ -51,8 +57,9 @@ def test_scores_are_of_systems_as_they_are_trained_now(name):
     # One run's config and the other's differ in the seed alone.
     assert differences({**trained, "train.seed": 0}, flatten_config(configs[system])) == []
     assert kept.training.summary.startswith(f"{configs[system].train.steps} steps, ")
-    for condition, answer in kept.conditions.items():
-        assert any(condition.startswith(f"{title}, {TEST_FRAMES} frames") for title in TITLES)
+    assert kept.first_stage == checksum_of(SHIPPED)
+    assert set(kept.conditions) == {asked(condition) for condition in CONDITIONS}
+    for answer in kept.conditions.values():
         assert all(len(values) == TEST_FRAMES for values in answer.scores.rows.values())
 
 
@@ -75,18 +82,44 @@ def test_its_numbers_are_their_means_and_what_is_missing_is_named(rows, system):
         if not there:
             assert row["ours"] is None
             continue
-        shuffled = "" if condition.change is None else " by 8, seed 0"
-        key = f"{condition.title}, {TEST_FRAMES} frames{shuffled}"
-        by_frame = []
-        for seed in there:
-            with np.load(FILES[f"{system.name}-{seed}"]) as arrays:
-                names = json.loads(str(arrays["about"]))["conditions"][key]["metrics"]
-                by_frame.append(dict(zip(names, arrays[f"{key}/scores"].astype(float), strict=True)))
-        for name, value in row["ours"].items():
-            mean = np.mean([one[name] for one in by_frame], axis=0)
-            np.testing.assert_allclose(value, mean.mean(), rtol=1e-9)
-            spread = mean.std(ddof=1) / np.sqrt(TEST_FRAMES)
-            np.testing.assert_allclose(row["standard_error"][name], spread, rtol=1e-9)
+        assert_means(row, [FILES[f"{system.name}-{seed}"] for seed in there], asked(condition))
+
+
+def asked(condition):
+    return condition.in_words(TEST_FRAMES, RunSettings().batch_size, DEFAULT_SEED)
+
+
+def assert_means(row, files, key):
+    by_frame = []
+    for file in files:
+        with np.load(file) as arrays:
+            names = json.loads(str(arrays["about"]))["conditions"][key]["metrics"]
+            by_frame.append(dict(zip(names, arrays[f"{key}/scores"].astype(float), strict=True)))
+    for name, value in row["ours"].items():
+        mean = np.mean([one[name] for one in by_frame], axis=0)
+        np.testing.assert_allclose(value, mean.mean(), rtol=1e-9)
+        spread = mean.std(ddof=1) / np.sqrt(TEST_FRAMES)
+        np.testing.assert_allclose(row["standard_error"][name], spread, rtol=1e-9)
+
+
+def test_the_fit_is_of_the_shipped_model(rows):
+    kept = ScoresFile(TABLES / KEPT / FITTED, TINY).read()
+    assert kept is not None
+    assert kept.weights == checksum_of(SHIPPED)
+    for condition in CONDITIONS:
+        assert_means(rows[condition.title, FITTING], [TABLES / KEPT / FITTED], asked(condition))
+
+
+@pytest.mark.parametrize("rig", TABLE_RIGS, ids=lambda rig: rig.name)
+def test_scores_are_of_the_captures_that_are_drawn_now(rig):
+    """Of two frames; and all files' of all frames agree."""
+    dataset = SyntheticDataset(captures_of(rig, CAPTURES), seed=rig.test_seed)
+    drawn = marks_of([dataset.sample(0)] * 25 + [dataset.sample(25)])
+    conditions = [asked(condition) for condition in CONDITIONS if condition.rig is rig]
+    files = [ScoresFile(path, TINY).read() for path in (*FILES.values(), TABLES / KEPT / FITTED)]
+    marks = [file.conditions[condition].captures for file in files for condition in conditions]
+    assert Marks(*(leaf[:2] for leaf in marks[0])).agree(drawn)
+    assert all(one.agree(marks[0]) for one in marks)
 
 
 @pytest.mark.parametrize("title", TITLES)

@@ -11,6 +11,7 @@ from poem_jax.models.presets import TINY, V2_NANO
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import FRONT, captures_of
+from poem_jax.tables import kept_scores
 from poem_jax.tables.kept_scores import Question, ScoresFile, marks_of
 from poem_jax.tables.training_summary import Training
 
@@ -115,13 +116,21 @@ def _longer_lens(one):
     return one._replace(cameras=one.cameras._replace(K=K))
 
 
+def _moved_middle(one):
+    K = np.array(one.cameras.K)
+    K[0, 1, 2] += 0.1
+    return one._replace(cameras=one.cameras._replace(K=K))
+
+
 def _brighter_view(one):
     views = np.array(one.views)
     views[0] = np.minimum(views[0].astype(int) + 1, 255)
     return one._replace(views=views)
 
 
-@pytest.mark.parametrize("change", [_moved_camera, _other_vertices, _longer_lens, _brighter_view])
+@pytest.mark.parametrize(
+    "change", [_moved_camera, _other_vertices, _longer_lens, _moved_middle, _brighter_view]
+)
 def test_other_captures_are_scored_anew(model, file, captures, change):
     score = Counted()
     others = [*captures[:25], change(captures[25])]
@@ -155,9 +164,20 @@ def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how
 def test_how_it_was_trained_is_kept_where_the_run_is_gone_and_added_where_it_turns_up(model, file, ring):
     assert file.scores(model, UNKNOWN, ring[0], Counted())[1] == UNKNOWN
     assert file.scores(model, TRAINED, ring[0], Counted())[1] == TRAINED
-    for question in ring:
-        assert file.scores(model, UNKNOWN, question, Counted())[1] == TRAINED
+    for training in (UNKNOWN, Training("another run in the same folder", "{}")):
+        for question in ring:
+            assert file.scores(model, training, question, Counted())[1] == TRAINED
     assert file.read().training == TRAINED
+
+
+def test_on_another_first_stage_scores_count_only_with_their_weights(model, file, ring, monkeypatch, caplog):
+    score = Counted()
+    file.scores(model, TRAINED, ring[0], score)
+    monkeypatch.setattr(kept_scores, "SHIPPED", planted_model(model.with_name("shipped"), "c"))
+    assert file.scores_without_model(ring[0]) is None
+    assert "another shipped first stage" in caplog.text
+    file.scores(model, TRAINED, ring[0], score)
+    assert score.calls == 1
 
 
 def test_new_weights_leave_nothing_of_the_old_ones(model, file, ring):

@@ -80,16 +80,16 @@ def test_made_again_it_is_the_same_and_scores_no_model_anew(results):
 def test_without_checkpoints_it_is_made_of_kept_scores_and_says_so(results):
     first, _, without = results
     for line, kept in zip(first.lines, without.lines, strict=True):
-        same = {key: words for key, words in kept.what.items() if key != "of kept scores"}
+        same = {key: words for key, words in kept.what.items() if key != "weights gone, scores kept"}
         assert (kept.ours, kept.spread, kept.ranks, same) == (line.ours, line.spread, line.ranks, line.what)
     line = line_of(without, "ring, 8 cameras", "POEM v1")
     assert not line.absent
     for seed in (0, 1):
         command = f"poem train synthetic_table:v1 --train.seed {seed}"
-        assert re.search(f"{seed}: no checkpoint in .*{command}", line.what["of kept scores"])
+        assert re.search(f"{seed}: no checkpoint in .*{command}", line.what["weights gone, scores kept"])
     (missing,) = line_of(without, "ring, 8 cameras", "MvP").absent
     assert "mvp-0" in missing
-    assert "mvp-1" in line_of(without, "ring, 8 cameras", "MvP").what["of kept scores"]
+    assert "mvp-1" in line_of(without, "ring, 8 cameras", "MvP").what["weights gone, scores kept"]
 
 
 def test_a_model_that_diverged_costs_its_own_line_alone(result):
