@@ -146,7 +146,7 @@ _NOTES = (
     f"`{CORNERS.name}` no camera stands where one stood in training. Trunk and heat maps are the shipped "
     "model's, for all, and stay as they are: they have seen random cameras.",
     "The recipe (rate, heads, steps, how query vectors begin) was changed after test errors of v2 and MvP "
-    "under a first one had been seen; the choices were by training errors of v2 and v1, and of no other system: "
+    "under a first one had been seen; the choices were by training errors of v2 and v1, and of no other: "
     "docs/tables.md. Query vectors begin as sines of the template, which is not the paper's; one row begins "
     "without.",
     "Seeds are of the first weights, and in v1 of the basis points that training draws, not of the captures. "
