@@ -58,6 +58,12 @@ class _ByValue:
 FIRST_STAGE = ("trunk", "heat_maps")
 """The modules of a first stage, by their names in `params`; systems without heat maps have a trunk alone."""
 
+
+def is_of_first_stage(name: str) -> bool:
+    """Say it of a parameter by its dotted name, `trainable.trunk.stem.kernel`."""
+    return name.split(".")[1] in FIRST_STAGE
+
+
 GROUPS = {"trainable": nnx.Param, "statistics": nnx.BatchStat, "constants": Constant}
 """Which kind of variable each part of `params` holds."""
 

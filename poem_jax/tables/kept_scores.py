@@ -2,8 +2,8 @@
 stands when their weights, which are large, are gone.
 
 A file a model: every metric of every frame, by condition, and what it was made of. It counts for the very
-same weights where these are there, else for a model of the same config on the same shipped first stage;
-always for the same captures. Kept are half numbers, three digits a frame, which are what the table is made of
+same weights where these are there, else for a model of the same config on the same first stage; always for
+the same captures. Kept are half numbers, three digits a frame, which are what the table is made of
 the first time, too.
 """
 
@@ -22,10 +22,11 @@ from poem_jax.evaluation.captures import CaptureScores
 from poem_jax.io.atomic import whole_file
 from poem_jax.io.npz_file import read_npz
 from poem_jax.models.config import ModelConfig
+from poem_jax.models.network import is_of_first_stage
 from poem_jax.tables.training_summary import Training
-from poem_jax.typing import Float
+from poem_jax.typing import Float, Params
 from poem_jax.weights.config_json import from_json, to_json
-from poem_jax.weights.store import CHECKSUMS_FILE, SHIPPED
+from poem_jax.weights.store import CHECKSUMS_FILE, flatten
 
 _log = logging.getLogger(__name__)
 _ABOUT = "about"
@@ -71,9 +72,9 @@ class KeptScores(NamedTuple):
     """What a file holds."""
 
     weights: str
-    """Checksum of the weights' checksums."""
+    """`checksum_of` the model."""
     first_stage: str
-    """The same of the shipped model, which lends its first stage."""
+    """`checksum_of_first_stage` of the model that lends it."""
     config: ModelConfig
     training: Training
     conditions: dict[str, _Answer]
@@ -91,14 +92,16 @@ class ScoresFile:
     path: Path
     config: ModelConfig
     """Of the model."""
+    first_stage: str
+    """`checksum_of_first_stage` of the one that all systems have."""
 
     def scores(
-        self, model: Path, training: Training, question: Question, score: Callable[[], CaptureScores]
+        self, weights: str, training: Training, question: Question, score: Callable[[], CaptureScores]
     ) -> tuple[CaptureScores, Training]:
         """Return what was kept of the same weights, else score and keep it; and how they were trained.
 
         Args:
-            model: folder of the checkpoint.
+            weights: `checksum_of` the model.
             training: how it was trained, as far as that is known; kept with the scores.
             question: captures and condition.
             score: computes them.
@@ -106,9 +109,9 @@ class ScoresFile:
         Raises:
             ValueError: `score` cannot; nothing is kept.
         """
-        weights, kept = checksum_of(model), self.read()
+        kept = self.read()
         if kept is None or (kept.weights, kept.config) != (weights, self.config):
-            kept = KeptScores(weights, checksum_of(SHIPPED), self.config, training, {})
+            kept = KeptScores(weights, self.first_stage, self.config, training, {})
         # The run's folder may hold another run by now.
         training = kept.training if kept.training.summary else training
         scores = kept.answer(question)
@@ -126,8 +129,8 @@ class ScoresFile:
         kept = self.read()
         if kept is None:
             return None
-        if (kept.first_stage, kept.config) != (checksum_of(SHIPPED), self.config):
-            _log.warning("%s is of another config, or of another shipped first stage", self.path)
+        if (kept.first_stage, kept.config) != (self.first_stage, self.config):
+            _log.warning("%s is of another config, or of another first stage", self.path)
             return None
         scores = kept.answer(question)
         if scores is None:
@@ -179,6 +182,16 @@ class ScoresFile:
 def checksum_of(model: Path) -> str:
     """Return a checksum of the weights in a folder, by those that they were sealed with."""
     return hashlib.sha256((model / CHECKSUMS_FILE).read_bytes()).hexdigest()
+
+
+def checksum_of_first_stage(params: Params) -> str:
+    """Return a checksum of a model's trunk and heat maps, whatever comes after them."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(flatten(params).items()):
+        if is_of_first_stage(name):
+            array = np.asarray(leaf)
+            digest.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def marks_of(captures: Sequence[MultiViewBatch]) -> Marks:

@@ -30,7 +30,13 @@ from poem_jax.evaluation.systems import Network, System
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import CORNERS, FRONT, RING, TEST_FRAMES, TableRig, captures_of
-from poem_jax.tables.kept_scores import Question, ScoresFile, marks_of
+from poem_jax.tables.kept_scores import (
+    Question,
+    ScoresFile,
+    checksum_of,
+    checksum_of_first_stage,
+    marks_of,
+)
 from poem_jax.tables.places import Places
 from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
@@ -168,10 +174,17 @@ class SyntheticTable:
         samples = TEST_FRAMES if settings.samples is None else min(settings.samples, TEST_FRAMES)
         opened = cache(partial(_opened, places))
         config, params = load(SHIPPED)
-        fitting = FirstStageFitting(config, params)
+        fitting, first_stage = FirstStageFitting(config, params), checksum_of_first_stage(params)
         # A quick look leaves the scores of all frames alone.
         kept_in = Path(settings.out) / (KEPT if samples == TEST_FRAMES else f"{KEPT}_{samples}")
-        fitted = ScoresFile(kept_in / FITTED, config)
+        fitted = ScoresFile(kept_in / FITTED, config, first_stage)
+        files = {
+            (system, seed): ScoresFile(
+                kept_in / f"{system.name}-{seed}.npz", TABLE_MODELS[system.name], first_stage
+            )
+            for system in TRAINED
+            for seed in SEEDS
+        }
         lines: list[Line] = []
         rig, captures = None, []
         for condition in tqdm(CONDITIONS, unit="condition", desc=self.name, disable=not settings.progress):
@@ -187,12 +200,13 @@ class SyntheticTable:
             )
             asked = condition.in_words(samples, settings.batch_size, settings.seed)
             question = Question(asked, marks_of(captures))
-            of_fit, _ = fitted.scores(SHIPPED, Training(), question, partial(score, fitting))
+            of_fit, _ = fitted.scores(first_stage, Training(), question, partial(score, fitting))
             baselines = _baselines(captures, of_fit)
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             for system in TRAINED:
                 seeds = {
-                    seed: _result(system, seed, places, kept_in, opened, question, score) for seed in SEEDS
+                    seed: _result(system, seed, places, files[system, seed], opened, question, score)
+                    for seed in SEEDS
                 }
                 group.append(_line_of_seeds(condition, system, seeds, samples))
             lines += ranked(group)
@@ -215,20 +229,19 @@ def _result(
     system: Trained,
     seed: int,
     places: Places,
-    kept_in: Path,
+    kept: ScoresFile,
     opened: Callable[[Trained, int], System | str],
     question: Question,
     score: Callable[[System], CaptureScores],
 ) -> _SeedResult:
     """Score a model, or take the scores that were kept of it; say what is missing."""
-    kept = ScoresFile(kept_in / f"{system.name}-{seed}.npz", TABLE_MODELS[system.name])
     model = opened(system, seed)
     if isinstance(model, str):
         earlier = kept.scores_without_model(question)
         return _SeedResult(absent=model) if earlier is None else _SeedResult(*earlier, absent=model)
     folder, training = system.folder(places, seed), training_of(system.run(places, seed))
     try:
-        return _SeedResult(*kept.scores(folder, training, question, partial(score, model)))
+        return _SeedResult(*kept.scores(checksum_of(folder), training, question, partial(score, model)))
     except ValueError as error:  # One that diverged costs its own line alone.
         return _SeedResult(absent=f"{folder} could not be scored: {error}")
 

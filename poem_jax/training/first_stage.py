@@ -1,6 +1,6 @@
 """A first stage that several systems share: trunk and heat maps of a trained model, put into another."""
 
-from poem_jax.models.network import FIRST_STAGE
+from poem_jax.models.network import is_of_first_stage
 from poem_jax.typing import Params
 from poem_jax.weights.store import flatten, unflatten
 
@@ -17,7 +17,7 @@ def with_first_stage(params: Params, of: Params, where: str) -> Params:
         ValueError: the two have not the same trunk or heat maps; names what differs.
     """
     ours, theirs = flatten(params), flatten(of)
-    wanted = [name for name in ours if name.split(".")[1] in FIRST_STAGE]
+    wanted = [name for name in ours if is_of_first_stage(name)]
     for name in wanted:
         shape = theirs[name].shape if name in theirs else "nothing"
         if shape != ours[name].shape:

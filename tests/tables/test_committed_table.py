@@ -11,7 +11,7 @@ from poem_jax.experiments.synthetic_table import configs
 from poem_jax.models.presets import TINY
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import TABLE_RIGS, TEST_FRAMES, captures_of
-from poem_jax.tables.kept_scores import Marks, ScoresFile, checksum_of, marks_of
+from poem_jax.tables.kept_scores import Marks, ScoresFile, checksum_of_first_stage, marks_of
 from poem_jax.tables.result import RunSettings
 from poem_jax.tables.synthetic import (
     CAPTURES,
@@ -27,11 +27,16 @@ from poem_jax.tables.synthetic import (
 )
 from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.training.config import differences, flatten_config
-from poem_jax.weights.store import SHIPPED
+from poem_jax.weights.store import shipped
 
 TABLES = Path(__file__).resolve().parents[2] / "docs" / "tables"
 FILES = {file.stem: file for file in sorted((TABLES / KEPT).glob("*.npz")) if file.name != FITTED}
 TITLES = [condition.title for condition in CONDITIONS]
+
+
+@pytest.fixture(scope="module")
+def first_stage():
+    return checksum_of_first_stage(shipped()[1])
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +52,9 @@ def test_there_are_some():
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_scores_are_of_systems_as_they_are_trained_now(name):
+def test_scores_are_of_systems_as_they_are_trained_now(name, first_stage):
     system, _, seed = name.rpartition("-")
-    kept = ScoresFile(FILES[name], TABLE_MODELS[system]).read()
+    kept = ScoresFile(FILES[name], TABLE_MODELS[system], first_stage).read()
     assert kept is not None
     assert kept.config == TABLE_MODELS[system]
     trained = json.loads(kept.training.config)
@@ -57,7 +62,7 @@ def test_scores_are_of_systems_as_they_are_trained_now(name):
     # One run's config and the other's differ in the seed alone.
     assert differences({**trained, "train.seed": 0}, flatten_config(configs[system])) == []
     assert kept.training.summary.startswith(f"{configs[system].train.steps} steps, ")
-    assert kept.first_stage == checksum_of(SHIPPED)
+    assert kept.first_stage == first_stage
     assert set(kept.conditions) == {asked(condition) for condition in CONDITIONS}
     for answer in kept.conditions.values():
         assert all(len(values) == TEST_FRAMES for values in answer.scores.rows.values())
@@ -102,21 +107,21 @@ def assert_means(row, files, key):
         np.testing.assert_allclose(row["standard_error"][name], spread, rtol=1e-9)
 
 
-def test_the_fit_is_of_the_shipped_model(rows):
-    kept = ScoresFile(TABLES / KEPT / FITTED, TINY).read()
+def test_the_fit_is_of_the_shipped_first_stage(rows, first_stage):
+    kept = ScoresFile(TABLES / KEPT / FITTED, TINY, first_stage).read()
     assert kept is not None
-    assert kept.weights == checksum_of(SHIPPED)
+    assert kept.weights == first_stage
     for condition in CONDITIONS:
         assert_means(rows[condition.title, FITTING], [TABLES / KEPT / FITTED], asked(condition))
 
 
 @pytest.mark.parametrize("rig", TABLE_RIGS, ids=lambda rig: rig.name)
-def test_scores_are_of_the_captures_that_are_drawn_now(rig):
+def test_scores_are_of_the_captures_that_are_drawn_now(rig, first_stage):
     """Of two frames; and all files' of all frames agree."""
     dataset = SyntheticDataset(captures_of(rig, CAPTURES), seed=rig.test_seed)
     drawn = marks_of([dataset.sample(0)] * 25 + [dataset.sample(25)])
     conditions = [asked(condition) for condition in CONDITIONS if condition.rig is rig]
-    files = [ScoresFile(path, TINY).read() for path in (*FILES.values(), TABLES / KEPT / FITTED)]
+    files = [ScoresFile(path, TINY, first_stage).read() for path in (*FILES.values(), TABLES / KEPT / FITTED)]
     marks = [file.conditions[condition].captures for file in files for condition in conditions]
     assert Marks(*(leaf[:2] for leaf in marks[0])).agree(drawn)
     assert all(one.agree(marks[0]) for one in marks)

@@ -3,22 +3,27 @@ without the weights, for the same config."""
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 from poem_jax.evaluation.captures import CaptureScores
+from poem_jax.models.apply import init
 from poem_jax.models.presets import TINY, V2_NANO
 from poem_jax.synthetic.config import SyntheticConfig
 from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.synthetic.table_rigs import FRONT, captures_of
-from poem_jax.tables import kept_scores
-from poem_jax.tables.kept_scores import Question, ScoresFile, marks_of
+from poem_jax.tables.kept_scores import Question, ScoresFile, checksum_of_first_stage, marks_of
 from poem_jax.tables.training_summary import Training
+from poem_jax.training.first_stage import with_first_stage
+from poem_jax.weights.store import flatten, unflatten
+from tests.micro import MICRO
 
 SCORES = CaptureScores({"mpvpe_mm": np.array([21.0, 2.5, 1 / 3]), "f_5": np.array([0.1, 0.2, 0.3])}, 1)
 FAR = CaptureScores({"mpvpe_mm": np.array([7e4, 2.5, 1 / 3])}, 0)
 TRAINED = Training("1000 steps", "{}")
 UNKNOWN = Training()
+WEIGHTS, OTHER_WEIGHTS = "a", "b"
 
 
 def some_captures(rig=FRONT):
@@ -38,13 +43,6 @@ def ring(captures):
     return [Question(f"ring, {cameras} cameras", marks_of(captures)) for cameras in (8, 4)]
 
 
-def planted_model(folder, weights="a"):
-    """Make a folder that has what a model's weights are known by."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "seal.json").write_text(weights)
-    return folder
-
-
 class Counted:
     def __init__(self, scores=SCORES):
         self.scores, self.calls = scores, 0
@@ -55,13 +53,8 @@ class Counted:
 
 
 @pytest.fixture
-def model(tmp_path):
-    return planted_model(tmp_path / "v2-0")
-
-
-@pytest.fixture
 def file(tmp_path):
-    return ScoresFile(tmp_path / "scores" / "v2-0.npz", V2_NANO)
+    return ScoresFile(tmp_path / "scores" / "v2-0.npz", V2_NANO, "first stage")
 
 
 def assert_close(scores, expected=SCORES):
@@ -72,9 +65,9 @@ def assert_close(scores, expected=SCORES):
 
 
 @pytest.mark.parametrize("expected", [SCORES, FAR])
-def test_the_same_is_scored_once_and_read_whole(model, file, ring, expected):
+def test_the_same_is_scored_once_and_read_whole(file, ring, expected):
     score = Counted(expected)
-    first, *others = (file.scores(model, TRAINED, ring[0], score)[0] for _ in range(3))
+    first, *others = (file.scores(WEIGHTS, TRAINED, ring[0], score)[0] for _ in range(3))
     assert_close(first, expected)
     for other in others:
         for name, values in first.rows.items():
@@ -82,17 +75,16 @@ def test_the_same_is_scored_once_and_read_whole(model, file, ring, expected):
     assert score.calls == 1
 
 
-def test_other_weights_configs_or_conditions_are_scored_anew(model, file, ring):
+def test_other_weights_configs_or_conditions_are_scored_anew(file, ring):
     score = Counted()
     for question in (*ring, *ring):
-        file.scores(model, TRAINED, question, score)
+        file.scores(WEIGHTS, TRAINED, question, score)
     assert score.calls == 2
-    planted_model(model, "b")
     for question in (*ring, *ring):
-        file.scores(model, TRAINED, question, score)
+        file.scores(OTHER_WEIGHTS, TRAINED, question, score)
     assert score.calls == 4
     other = replace(file, config=TINY)
-    other.scores(model, TRAINED, ring[0], score)
+    other.scores(OTHER_WEIGHTS, TRAINED, ring[0], score)
     assert score.calls == 5
     assert other.scores_without_model(ring[0]) is not None
     assert file.scores_without_model(ring[0]) is None
@@ -131,27 +123,25 @@ def _brighter_view(one):
 @pytest.mark.parametrize(
     "change", [_moved_camera, _other_vertices, _longer_lens, _moved_middle, _brighter_view]
 )
-def test_other_captures_are_scored_anew(model, file, captures, change):
+def test_other_captures_are_scored_anew(file, captures, change):
     score = Counted()
     others = [*captures[:25], change(captures[25])]
     for some in (captures, others, captures[:25]):
-        file.scores(model, TRAINED, Question("front", marks_of(some)), score)
+        file.scores(WEIGHTS, TRAINED, Question("front", marks_of(some)), score)
     assert score.calls == 3
 
 
-def test_another_machine_that_rounds_otherwise_knows_the_captures_again(model, file, captures):
+def test_another_machine_that_rounds_otherwise_knows_the_captures_again(file, captures):
     score = Counted()
     rounded = [one._replace(vertices_world=one.vertices_world + 1e-6) for one in captures]
     for some in (captures, rounded, some_captures()):
-        file.scores(model, TRAINED, Question("front", marks_of(some)), score)
+        file.scores(WEIGHTS, TRAINED, Question("front", marks_of(some)), score)
     assert score.calls == 1
 
 
-def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how_it_was_trained(
-    model, file, ring
-):
+def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how_it_was_trained(file, ring):
     for question in ring:
-        file.scores(model, TRAINED, question, Counted())
+        file.scores(WEIGHTS, TRAINED, question, Counted())
     for question in ring:
         scores, training = file.scores_without_model(question)
         assert_close(scores)
@@ -161,45 +151,45 @@ def test_without_its_weights_a_model_of_the_same_config_keeps_its_scores_and_how
     assert replace(file, path=file.path.with_name("v2-1.npz")).scores_without_model(ring[0]) is None
 
 
-def test_how_it_was_trained_is_kept_where_the_run_is_gone_and_added_where_it_turns_up(model, file, ring):
-    assert file.scores(model, UNKNOWN, ring[0], Counted())[1] == UNKNOWN
-    assert file.scores(model, TRAINED, ring[0], Counted())[1] == TRAINED
+def test_how_it_was_trained_is_kept_where_the_run_is_gone_and_added_where_it_turns_up(file, ring):
+    assert file.scores(WEIGHTS, UNKNOWN, ring[0], Counted())[1] == UNKNOWN
+    assert file.scores(WEIGHTS, TRAINED, ring[0], Counted())[1] == TRAINED
     for training in (UNKNOWN, Training("another run in the same folder", "{}")):
         for question in ring:
-            assert file.scores(model, training, question, Counted())[1] == TRAINED
+            assert file.scores(WEIGHTS, training, question, Counted())[1] == TRAINED
     assert file.read().training == TRAINED
 
 
-def test_on_another_first_stage_scores_count_only_with_their_weights(model, file, ring, monkeypatch, caplog):
+def test_on_another_first_stage_scores_count_only_with_their_weights(file, ring, caplog):
     score = Counted()
-    file.scores(model, TRAINED, ring[0], score)
-    monkeypatch.setattr(kept_scores, "SHIPPED", planted_model(model.with_name("shipped"), "c"))
-    assert file.scores_without_model(ring[0]) is None
-    assert "another shipped first stage" in caplog.text
-    file.scores(model, TRAINED, ring[0], score)
+    file.scores(WEIGHTS, TRAINED, ring[0], score)
+    other = replace(file, first_stage="another")
+    assert other.scores_without_model(ring[0]) is None
+    assert "another first stage" in caplog.text
+    other.scores(WEIGHTS, TRAINED, ring[0], score)
     assert score.calls == 1
 
 
-def test_new_weights_leave_nothing_of_the_old_ones(model, file, ring):
-    file.scores(model, TRAINED, ring[1], Counted())
-    file.scores(planted_model(model, "b"), UNKNOWN, ring[0], Counted())
+def test_new_weights_leave_nothing_of_the_old_ones(file, ring):
+    file.scores(WEIGHTS, TRAINED, ring[1], Counted())
+    file.scores(OTHER_WEIGHTS, UNKNOWN, ring[0], Counted())
     assert file.scores_without_model(ring[1]) is None
     assert file.scores_without_model(ring[0])[1] == UNKNOWN
 
 
-def test_a_model_that_cannot_be_scored_keeps_nothing(model, file, ring):
+def test_a_model_that_cannot_be_scored_keeps_nothing(file, ring):
     def diverged():
         raise ValueError("not finite")
 
     with pytest.raises(ValueError, match="not finite"):
-        file.scores(model, TRAINED, ring[0], diverged)
+        file.scores(WEIGHTS, TRAINED, ring[0], diverged)
     assert not file.path.exists()
 
 
 @pytest.mark.parametrize("damage", ["cut", "[1, 2]", '{"conditions": []}', "text"])
-def test_a_damaged_file_is_told_put_aside_and_made_anew(model, file, ring, caplog, damage):
+def test_a_damaged_file_is_told_put_aside_and_made_anew(file, ring, caplog, damage):
     score = Counted()
-    file.scores(model, TRAINED, ring[0], score)
+    file.scores(WEIGHTS, TRAINED, ring[0], score)
     if damage == "cut":
         file.path.write_bytes(file.path.read_bytes()[:-40])
     elif damage == "text":
@@ -209,13 +199,25 @@ def test_a_damaged_file_is_told_put_aside_and_made_anew(model, file, ring, caplo
     damaged = file.path.read_bytes()
     assert file.scores_without_model(ring[0]) is None
     for _ in range(2):
-        assert_close(file.scores(model, TRAINED, ring[0], score)[0])
+        assert_close(file.scores(WEIGHTS, TRAINED, ring[0], score)[0])
     assert score.calls == 2
     assert "cannot be read" in caplog.text
     assert file.path.with_suffix(".damaged").read_bytes() == damaged
 
 
-def test_scores_that_cannot_be_kept_are_given_all_the_same(model, file, ring, caplog):
+def test_scores_that_cannot_be_kept_are_given_all_the_same(file, ring, caplog):
     file.path.parent.write_text("a file where the folder should be")
-    assert_close(file.scores(model, TRAINED, ring[0], Counted())[0])
+    assert_close(file.scores(WEIGHTS, TRAINED, ring[0], Counted())[0])
     assert "scores are not kept" in caplog.text
+
+
+def test_a_first_stage_is_known_by_trunk_and_heat_maps_alone():
+    """New weights of a second stage leave scores that were made without it alone."""
+    params, others = (init(MICRO, key=jax.random.key(seed)) for seed in (1, 2))
+    lent = with_first_stage(others, params, "donor")
+    assert checksum_of_first_stage(lent) == checksum_of_first_stage(params) != checksum_of_first_stage(others)
+    for name in ("trainable.trunk", "statistics.trunk", "trainable.heat_maps"):
+        leaves = flatten(lent)
+        moved = next(one for one in leaves if one.startswith(name))
+        changed = unflatten({**leaves, moved: leaves[moved] + 1e-3}, lent)
+        assert checksum_of_first_stage(changed) != checksum_of_first_stage(params), moved
