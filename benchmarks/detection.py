@@ -1,10 +1,11 @@
 """Time of the hand detector an image, beside MediaPipe's own: `python benchmarks/detection.py FOLDER`.
 
-FOLDER holds photographs (.jpg, .png), looked through at any depth. MediaPipe runs in a process of its own,
-in the environment whose interpreter `--mediapipe PYTHON` names (it does not go together with ours); without
-it our figures stand alone. Both look at RGB images that they have just decoded, each by itself, for at most
-two hands, with the full models. They take turns, all images each (with turns image by image the threads of
-one still wait for work while the other is timed), and the medians over the turns are compared.
+Without FOLDER nothing is timed. FOLDER holds photographs (.jpg, .png), looked through at any depth. MediaPipe
+runs in a process of its own, in the environment whose interpreter `--mediapipe PYTHON` names (it does not go
+together with ours); without it our figures stand alone. Both look at RGB images that they have just decoded,
+each by itself, for at most two hands, with the full models. They take turns, all images each (with turns
+image by image the threads of one still wait for work while the other is timed), and the medians over the
+turns are compared.
 """
 
 import argparse
@@ -83,11 +84,14 @@ def our_time(path: Path) -> float:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="Time of the hand detector an image.")
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--mediapipe", metavar="PYTHON")
     parser.add_argument("--images", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
+    if options.folder is None:
+        print("skipped: say a FOLDER of photographs")
+        return
     use_compilation_cache()
     paths = sorted(p for p in options.folder.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
     paths = paths[:: max(1, len(paths) // options.images)][: options.images]

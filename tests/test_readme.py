@@ -4,12 +4,17 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from poem_jax import preset
+from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.models.poem_v1_config import one_stage
+from poem_jax.synthetic.dataset import SyntheticDataset
+from poem_jax.weights.store import shipped
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -69,3 +74,32 @@ def test_the_code_of_the_models_page_makes_an_experiment_and_a_mean_root() -> No
     exec(compile(mean.replace("range(100)", "range(1)"), "docs/models.md", "exec"), names)
     assert 0.3 < names["origin"][2] < 1.5
     assert names["model"] == one_stage(names["origin"])
+
+
+def test_the_code_of_the_geometry_page_triangulates_and_reconstructs_from_photographs() -> None:
+    page = (ROOT / "docs" / "geometry.md").read_text()
+    gradient, crops = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict = {}
+    exec(compile(gradient, "docs/geometry.md", "exec"), names)
+    assert bool(names["valid"].all())
+    np.testing.assert_allclose(names["found"], names["point"], atol=1e-5)
+    # Depth by disparity: Z^2 / (f b).
+    slope = abs(names["metres_per_pixel"][0, 2, 1, 0, 0])
+    np.testing.assert_allclose(slope, 0.7**2 / (900 * 0.2), rtol=0.05)
+    exec(compile(crops, "docs/geometry.md", "exec"), names)
+    config, params = shipped()
+    sample = SyntheticDataset(replace(benchmark, image_hw=(256, 256)), seed=9)[0]
+    points = sample.keypoints_px
+    boxes = np.concatenate([points.min(1), points.max(1)], -1).astype(np.float64)
+    K, T, _ = sample.cameras
+    hand = names["reconstruct"](sample.views, K.astype(np.float64), T, boxes, config, params)
+    assert 1000 * np.linalg.norm(hand.vertices_world[0] - sample.vertices_world, axis=-1).mean() < 12
+
+
+def test_geometry_gives_what_it_names_and_imports_no_jax_for_it() -> None:
+    import poem_jax.geometry as geometry
+
+    assert all(callable(getattr(geometry, name)) for name in geometry.__all__)
+    assert set(geometry.__all__) == set(geometry._HOME)
+    code = "import sys, poem_jax.geometry; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

@@ -170,6 +170,7 @@ class Eval:
 
     def _run_experiment(self, experiment: str) -> None:
         from poem_jax.evaluation.benchmark import BenchmarkSettings, model_predictor, run_benchmark
+        from poem_jax.evaluation.first_stage_fitting import FirstStageFitting, sees_joints
         from poem_jax.evaluation.protocols import PROTOCOLS
         from poem_jax.evaluation.stages import check_has_stages
         from poem_jax.evaluation.tables import format_report, write_json
@@ -205,7 +206,8 @@ class Eval:
         hand = hand_of_captures(params)
         say(f"{samples} captures; every view count compiles a program, once on this machine")
         start = time.perf_counter()
-        results = run_benchmark(model_predictor(params, config.model), captures, settings, hand)
+        fitting = FirstStageFitting(config.model, params) if sees_joints(config.model) else None
+        results = run_benchmark(model_predictor(params, config.model), captures, settings, hand, fitting)
         seconds = time.perf_counter() - start
         if self.json is not None:
             write_json(self.json, results)

@@ -69,8 +69,9 @@ class Reconstruct:
     """Write the meshes of every frame of a take too, not only its animation."""
     formats: Formats = "glb"
     """What to write besides arrays, page, report and overlays, with commas between: glb (animation of a
-    take), bvh (skeletons), csv (joints and angles), trc (markers), mano (parameters); video or png: overlays
-    as such, else as images of a take of up to 20 frames, and as videos of a longer one."""
+    take), bvh (skeletons), csv (joints and angles), trc (markers), mano (parameters), capture (a labelled
+    capture, to train on); video or png: overlays as such, else as images of a take of up to 20 frames, and as
+    videos of a longer one."""
     debug: Flag = False
     """Show the full traceback of an error."""
 

@@ -18,6 +18,7 @@ from poem_jax.data.batching import collate, pad_batch, pad_views
 from poem_jax.evaluation.baselines import mean_pose, mean_pose_rotated, noisy_dlt_roots
 from poem_jax.evaluation.metrics import evaluate, point_distances
 from poem_jax.evaluation.protocols import MM_PER_METRE, find_protocol
+from poem_jax.evaluation.systems import Answer, System
 from poem_jax.geometry.cameras import Cameras
 from poem_jax.hand.model import HandModel
 from poem_jax.hand.topology import ROOT_JOINT
@@ -87,6 +88,8 @@ class _Rows(NamedTuple):
     """NaN for a model without a root."""
     vertices_given: np.ndarray
     """NaN for a model that takes no root."""
+    vertices_fitted: np.ndarray
+    """NaN where there is no fit to compare with."""
     valid: np.ndarray
     dlt_root: np.ndarray
 
@@ -124,7 +127,11 @@ def model_predictor(params: Params, config: ModelConfig) -> Predictor:
 
 
 def run_benchmark(
-    predict: Predictor, captures: Captures, settings: BenchmarkSettings, hand: HandModel | None = None
+    predict: Predictor,
+    captures: Captures,
+    settings: BenchmarkSettings,
+    hand: HandModel | None = None,
+    fitting: System | None = None,
 ) -> dict[int, Scores]:
     """Score a model on captures 0, 1, ... for every view count.
 
@@ -133,11 +140,14 @@ def run_benchmark(
         captures: samples with `pose`, at least as many views as `settings.views` asks for.
         settings: sizes and definitions.
         hand: whose regressor the protocol `poem-release` uses; the others need none.
+        fitting: the fit to the key points of the model's own first stage, which it must beat; None = it has
+            no such key points.
 
     Returns: per view count the metrics of `evaluate`, and `median_mpvpe_mm`, `mpvpe_true_root_mm` and its
     `median_`, `root_error_mm`, `dlt_2px_root_error_mm`, `mean_pose_mpvpe_mm`, `mean_pose_rotated_mpvpe_mm`,
-    `samples` and `unsolved` (samples that the model itself calls invalid; they count in all errors). Errors
-    of a root that the model does not have, or with a true root that it does not take, are None.
+    `fit_mpvpe_mm` and its `median_`, `samples` and `unsolved` (samples that the model itself calls invalid;
+    they count in all errors). Errors of a root that the model does not have, with a true root that it does
+    not take, or of a fit that there is not are None.
 
     Raises:
         ValueError: a prediction that is not finite.
@@ -153,7 +163,8 @@ def run_benchmark(
             truths.append(_without_padding(batch, _truth(batch)))
             for n in settings.views:
                 part = nested_views(batch, n)
-                rows[n].append(_without_padding(batch, _row(part, predict(part), draws[:, :n])))
+                fitted = None if fitting is None or n < fitting.least_views else fitting(part, ())
+                rows[n].append(_without_padding(batch, _row(part, predict(part), fitted, draws[:, :n])))
                 bar.update()
     truth = _joined(truths)
     return {n: _scores(_joined(rows[n]), truth, settings.protocol, hand) for n in settings.views}
@@ -199,7 +210,9 @@ def _truth(batch: MultiViewBatch) -> _Truth:
     return _Truth(*map(_float64, (batch.joints_world, batch.vertices_world, batch.pose[:, 0], primary)))
 
 
-def _row(batch: MultiViewBatch, predicted: Reconstructions, noise: np.ndarray) -> _Rows:
+def _row(
+    batch: MultiViewBatch, predicted: Reconstructions, fitted: Answer | None, noise: np.ndarray
+) -> _Rows:
     found, given = predicted
     K, T_cam_from_world, _ = batch.cameras
     root_px = batch.keypoints_px[:, :, ROOT_JOINT]
@@ -210,6 +223,7 @@ def _row(batch: MultiViewBatch, predicted: Reconstructions, noise: np.ndarray) -
         vertices=vertices,
         root=no_root if found.root_world is None else _float64(found.root_world),
         vertices_given=np.full_like(vertices, np.nan) if given is None else _float64(given.vertices_world),
+        vertices_fitted=np.full_like(vertices, np.nan) if fitted is None else _float64(fitted.vertices_world),
         valid=np.asarray(found.valid),
         dlt_root=noisy_dlt_roots(root_px, K, T_cam_from_world, noise),
     )
@@ -232,24 +246,31 @@ def _scores(rows: _Rows, truth: _Truth, protocol: str, hand: HandModel | None) -
     one_constant = mean_pose(truth.vertices, truth.joints, truth.T_primary_from_world)
     turned = mean_pose_rotated(truth.vertices, truth.joints, truth.global_rotation)
     root_true = truth.joints[:, ROOT_JOINT]
-    found, given, constant, rotated = (
+    found, given, fitted, constant, rotated = (
         MM_PER_METRE * point_distances(vertices, truth.vertices).mean(-1)
-        for vertices in (rows.vertices, rows.vertices_given, one_constant, turned)
+        for vertices in (rows.vertices, rows.vertices_given, rows.vertices_fitted, one_constant, turned)
     )
     official = evaluate(
         rows.joints, truth.joints, rows.vertices, truth.vertices, protocol=protocol, hand=hand
     )
     return official | {
         "median_mpvpe_mm": float(np.median(found)),
-        "mpvpe_true_root_mm": None if np.isnan(given).any() else float(given.mean()),
-        "median_mpvpe_true_root_mm": None if np.isnan(given).any() else float(np.median(given)),
+        "mpvpe_true_root_mm": _known(np.mean(given)),
+        "median_mpvpe_true_root_mm": _known(np.median(given)),
         "root_error_mm": _mean_mm(rows.root, root_true),
         "dlt_2px_root_error_mm": _mean_mm(rows.dlt_root, root_true),
         "mean_pose_mpvpe_mm": float(constant.mean()),
         "mean_pose_rotated_mpvpe_mm": float(rotated.mean()),
+        "fit_mpvpe_mm": _known(np.mean(fitted)),
+        "median_fit_mpvpe_mm": _known(np.median(fitted)),
         "samples": len(found),
         "unsolved": int((~rows.valid).sum()),
     }
+
+
+def _known(value: np.floating) -> float | None:
+    """Return None for NaN, which stands where there was nothing."""
+    return None if np.isnan(value) else float(value)
 
 
 def _mean_mm(points: np.ndarray, truth: np.ndarray) -> float | None:

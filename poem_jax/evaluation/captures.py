@@ -118,11 +118,26 @@ def score_hands(found: Hands, truth: Hands) -> dict[str, Float[np.ndarray, " sam
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def mean_hands(captures: Sequence[MultiViewBatch]) -> Hands:
+def primary_cameras(
+    captures: Sequence[MultiViewBatch],
+    num_views: int,
+    *,
+    batch_size: int,
+    change: Change | None = None,
+    seed: int = 0,
+) -> Float[np.ndarray, "sample 4 4"]:
+    """Return T_cam_from_world of the camera in whose frame a system works; arguments as of `batches_of`."""
+    without_images = [one._replace(views=one.views[:, :1, :1]) for one in captures]
+    batches = batches_of(without_images, num_views, batch_size=batch_size, change=change, seed=seed)
+    return np.concatenate([one.cameras.T_cam_from_world[one.sample_mask, 0] for one in batches])
+
+
+def mean_hands(
+    captures: Sequence[MultiViewBatch], T_primary_from_world: Float[np.ndarray, "sample 4 4"]
+) -> Hands:
     """Return the mean of the very hands that are tested, at the true root; see `baselines.mean_pose`."""
-    truth = truth_of(captures)
-    primary = np.stack([one.cameras.T_cam_from_world[0] for one in captures]).astype(np.float64)
-    return Hands(*(mean_pose(points, truth.joints, primary) for points in truth))
+    truth, T = truth_of(captures), T_primary_from_world.astype(np.float64)
+    return Hands(*(mean_pose(points, truth.joints, T) for points in truth))
 
 
 def mean_hands_rotated(captures: Sequence[MultiViewBatch]) -> Hands:

@@ -83,9 +83,15 @@ class SetScores(NamedTuple):
     joints_alone: bool
     """Labels have no vertices, or those of another hand than the system's."""
     unsolved: int
-    """Samples in which the system found no hand; they are in no mean."""
+    """Samples, or with `each_view` their images, in which the system found no hand; they are in no mean."""
     left_out: tuple[str, ...]
     """Samples that could not be used, one line each."""
+    num_samples: int
+    """That the system looked at."""
+    num_roots_given: int
+    """Samples of which it was given the true root."""
+    num_cut: int
+    """Samples of which it saw fewer views than the rule takes, for it takes no more."""
 
     @property
     def means(self) -> dict[str, float]:
@@ -113,6 +119,8 @@ class _Read(NamedTuple):
     index: int
     sample: MultiViewBatch
     seen: Seen
+    knows_root: bool
+    is_cut: bool
 
 
 def standard_error(values: Float[np.ndarray, " sample"]) -> float:
@@ -141,7 +149,8 @@ def score_set(
     left_out: list[str] = []
     keys: list[str] = []
     rows: list[dict[str, float]] = []
-    unsolved, compares_vertices = 0, None
+    unsolved, num_roots_given, num_cut, num_samples = 0, 0, 0, 0
+    compares_vertices = None
     protocol = settings.protocol
     count = len(source) if settings.samples is None else min(settings.samples, len(source))
     with tqdm(total=count, unit="sample", desc=source.name, disable=not settings.progress) as bar:
@@ -154,21 +163,35 @@ def score_set(
                 batch = settings.change(batch, key=key)
             answer = system(batch, [one.seen for one in read])
             for place, one in enumerate(read):
-                for view in one.seen.views if settings.each_view else one.seen.views[:1]:
+                scored_in = one.seen.views if settings.each_view else one.seen.views[:1]
+                for view in scored_in:
                     hand = _in_view(answer, place, one, int(view))
                     if answer.valid[place]:
                         if listen is not None:
                             listen(hand)
                         rows.append(_evaluated(hand, one, protocol, compares_vertices, system.hand))
                         keys.append(_key(one, int(view), settings.each_view))
-                unsolved += not answer.valid[place]
+                unsolved += 0 if answer.valid[place] else len(scored_in)
+                num_roots_given += one.knows_root
+                num_cut += one.is_cut
+                num_samples += 1
             bar.update(len(read))
     for line in left_out:
         _log.warning("left out: %s", line)
     if compares_vertices is None:
         raise ValueError(f"none of {count} samples of {source.name} can be used: {'; '.join(left_out[:3])}")
     by_metric = {name: np.array([row[name] for row in rows]) for name in rows[0]} if rows else {}
-    return SetScores(tuple(keys), by_metric, protocol, not compares_vertices, unsolved, tuple(left_out))
+    return SetScores(
+        tuple(keys),
+        by_metric,
+        protocol,
+        not compares_vertices,
+        unsolved,
+        tuple(left_out),
+        num_samples,
+        num_roots_given,
+        num_cut,
+    )
 
 
 def is_of_hand(hand: HandModel, sample: MultiViewBatch) -> bool:
@@ -223,14 +246,18 @@ def _read(system: System, source: FrameSource, settings: SetSettings, index: int
     """Read a sample with nothing augmented, its views drawn from seed and index; a line where it is of no
     use to the system."""
     frame = source[index]
-    views = settings.cameras.draw(len(frame.images), np.random.default_rng((settings.seed, index)), most)
+    views, wanted = (
+        settings.cameras.draw(len(frame.images), np.random.default_rng((settings.seed, index)), limit)
+        for limit in (most, None)
+    )
     knows_root = system.takes_root and (settings.given_root or len(views) == 1)
     if len(views) < system.least_views and not knows_root:
         return f"{source.name} {frame.key}: {len(views)} view of a hand, and the system needs two"
     # Nothing is left to chance; augmenting draws all the same.
     sample = augment(frame, views, system.recipe, system.image_hw, np.random.default_rng(0))
     root = sample.joints_world[ROOT_JOINT] if knows_root else np.full(3, np.nan, np.float32)
-    return _Read(index, sample._replace(pose=None, shape=None, root_world=root), Seen(frame, views))
+    sample = sample._replace(pose=None, shape=None, root_world=root)
+    return _Read(index, sample, Seen(frame, views), knows_root, len(wanted) > most)
 
 
 def _batch(group: Sequence[_Read], size: int, most: int) -> MultiViewBatch:

@@ -22,7 +22,8 @@ def shuffle_cameras(batch: MultiViewBatch, *, key: PRNGKeyArray) -> MultiViewBat
 
 
 def drop_cameras(batch: MultiViewBatch, num_views: int, *, key: PRNGKeyArray) -> MultiViewBatch:
-    """Keep `num_views` random valid views of each sample, in random order; the others are masked.
+    """Keep `num_views` random valid views of each sample, in random order; the others are masked, and the
+    padded number of views stays.
 
     A sample with fewer keeps all that it has.
 
@@ -41,7 +42,7 @@ def replace_cameras(
     """Give each sample its first `num_views` views, but `num_replaced` of them, at random, exchanged.
 
     What comes in their places are views that the sample has beyond the first `num_views`, at random; where it
-    has too few, fewer are exchanged. The rest is masked.
+    has too few, fewer are exchanged. The result has `num_views` views.
 
     Raises:
         ValueError: `num_views` leaves no view to exchange with, or `num_replaced` is more than `num_views`.

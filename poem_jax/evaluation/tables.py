@@ -46,6 +46,8 @@ STAGE_COLUMNS = (
     Column("DLT 2 px", "dlt_2px_root_error_mm"),
     Column("mean pose", "mean_pose_mpvpe_mm"),
     Column("turned", "mean_pose_rotated_mpvpe_mm"),
+    Column("fit", "fit_mpvpe_mm"),
+    Column("its median", "median_fit_mpvpe_mm"),
     Column("unsolved", "unsolved", 0),
 )
 """Which stage fails: vertex errors with the model's and with the true root, the root's error, baselines."""
@@ -57,7 +59,8 @@ RR-V, PA-V       MPVPE relative to the wrist, and after Procrustes alignment
 root             error of the root joint that the model triangulates
 DLT 2 px         error of the root triangulated from its true pixels with 2 px of noise
 mean pose        baseline at the true root: the captures' mean mesh in the primary camera's frame
-turned           baseline at the true root: their mean hand, turned by the true global rotation"""
+turned           baseline at the true root: their mean hand, turned by the true global rotation
+fit, its median  baseline: the solver of `poem fit` on the key points of the model's own first stage"""
 JOINTS_LEGEND = "joint columns: the 21 joints that the model predicts, not joints regressed from its vertices"
 REGRESSED_LEGEND = "joint columns: joints regressed from the vertices of both sides; AUC-J: predicted joints"
 GIVEN_ROOT_LEGEND = (

@@ -63,7 +63,8 @@ def as_json(result: TableResult) -> dict[str, Any]:
                 "standard_error": _numbers(line.spread),
                 "samples": line.samples,
                 "views": line.num_views,
-                "ranks": dict(line.ranks),
+                "beside": dict(line.beside),
+                "degrade_percent": _degrade(line, result.lines),
                 "how": dict(line.what),
                 "notes": list(line.notes),
                 "absent": list(line.absent),
@@ -96,34 +97,51 @@ def degrade_percent(numbers: Mapping[str, float], base: Mapping[str, float]) -> 
 def _group(title: str, lines: Sequence[Line]) -> list[str]:
     """Write the lines of one data set under their own head."""
     columns = [COLUMNS[name] for name in lines[0].columns]
-    ranks = list(dict.fromkeys(name for line in lines for name in line.ranks))
-    head = ["#", "method", *(column.title for column in columns), "±", "samples", *ranks]
+    beside = list(dict.fromkeys(name for line in lines for name in line.beside))
+    head = ["#", "method", *(column.title for column in columns), "±", "samples", *beside]
+    printed = {column.metric: _printed_decimals(lines, column) for column in columns}
     rows = []
     for line in lines:
         ours = line.ours or {}
-        cells = [_cell(ours.get(c.metric), line.paper.get(c.metric), c.decimals) for c in columns]
+        cells = [
+            _cell(ours.get(c.metric), line.paper.get(c.metric), c.decimals, printed[c.metric])
+            for c in columns
+        ]
         error = line.spread.get(columns[0].metric)
         spread = ABSENT if error is None or math.isnan(error) else f"{error:.{columns[0].decimals}f}"
         number = "" if line.number is None else str(line.number)
         count = ABSENT if line.samples is None else str(line.samples)
         rows.append(
-            [number, line.label, *cells, spread, count, *(line.ranks.get(name, "") for name in ranks)]
+            [number, line.label, *cells, spread, count, *(line.beside.get(name, "") for name in beside)]
         )
-        base = next((one for one in lines if one.label == line.against), None)
-        if base is not None:
-            rows.append(["", "% degrade", *_degrade_cells(line, base, columns), "", "", *[""] * len(ranks)])
+        degrade = _degrade(line, lines)
+        if degrade is not None:
+            ours, paper = degrade["ours"], degrade["paper"]
+            cells = [_cell(ours.get(c.metric), paper.get(c.metric), 0, 0) for c in columns]
+            rows.append(["", "% degrade", *cells, "", "", *[""] * len(beside)])
     return [f"## {title}", "", *_markdown_rows(head, rows)]
 
 
-def _degrade_cells(line: Line, base: Line, columns: Sequence[Column]) -> list[str]:
-    paper = degrade_percent(line.paper, base.paper)
+def _degrade(line: Line, lines: Sequence[Line]) -> dict[str, dict[str, float]] | None:
+    """Return by how much ours and the paper's errors are larger than those of the line that it names, which
+    stands in the same group."""
+    base = next((one for one in lines if (one.group, one.label) == (line.group, line.against)), None)
+    if base is None:
+        return None
     ours = degrade_percent(line.ours or {}, base.ours or {})
-    return [_cell(ours.get(column.metric), paper.get(column.metric), 0) for column in columns]
+    return {"ours": ours, "paper": degrade_percent(line.paper, base.paper)}
 
 
-def _cell(ours: float | None, paper: float | None, decimals: int) -> str:
+def _printed_decimals(lines: Sequence[Line], column: Column) -> int:
+    """Return how many decimals the paper prints in a column: those of its longest number, since a number has
+    lost its last zeros."""
+    numbers = [line.paper[column.metric] for line in lines if column.metric in line.paper]
+    return max((len(f"{number:.3f}".rstrip("0").partition(".")[2]) for number in numbers), default=0)
+
+
+def _cell(ours: float | None, paper: float | None, decimals: int, printed: int) -> str:
     own = ABSENT if ours is None else f"{ours:.{decimals}f}"
-    return own if paper is None else f"{own} ({paper:.{decimals}f})"
+    return own if paper is None else f"{own} ({paper:.{printed}f})"
 
 
 def _markdown_rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -53,6 +53,7 @@ table = Table(
             (7.33, 8.71, 5.29, 0.65, 7.22, 8.77, 5.19, 0.65),
             Fitting(Solver.ADAM, KEYPOINTS),
             number=5,
+            protocol=AS_PREDICTED,
             note=WITHOUT_MASKS,
         ),
         Row(
@@ -60,6 +61,7 @@ table = Table(
             DEXYCB,
             AT_20_MM,
             system=Fitting(Solver.LEVENBERG_MARQUARDT, KEYPOINTS),
+            protocol=AS_PREDICTED,
             note="not in the paper; the same key points",
         ),
         _oakink(6, POEM, "v1", 6.20, 7.63, 4.21, 0.70, 6.01, 7.46, 4.00, 0.69),

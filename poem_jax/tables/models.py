@@ -13,11 +13,13 @@ _V2 = {
     "v2-param": ("v2_param_six_sets", "v2-medium-mano", "medium_MANO.pth.tar"),
 }
 """Experiment, variant and released file, by preset."""
+_MEAN_ROOT = " --model.first-stage.origin X Y Z"
+"""Of the training set: docs/models.md."""
 
 
 def v1(preset: str, dataset: str) -> Checkpoint:
     """Return the checkpoint of POEM v1, an ablation or a baseline, trained on one set (`dexycb`)."""
-    ways = [_trained(f"v1_paper:{preset}-{dataset}")]
+    ways = [_trained(f"v1_paper:{preset}-{dataset}", _MEAN_ROOT if preset == "v1-1stage" else "")]
     if preset in _RELEASED_V1:
         ways.append(
             f"poem import-torch FILE --variant {_RELEASED_V1[preset]} --dataset {dataset} --mano {{mano}} "
@@ -36,5 +38,6 @@ def v2(preset: str) -> Checkpoint:
     return Checkpoint(preset, preset, (_trained(experiment), released))
 
 
-def _trained(experiment: str) -> str:
-    return f"poem train {experiment}; then poem train {experiment} --export {{out}}"
+def _trained(experiment: str, options: str = "") -> str:
+    start = f"poem train {experiment}{options} --train.init-from IMAGENET"
+    return f"{start}; then the same with --export {{out}}   (IMAGENET: the paper's trunk, docs/weights.md)"

@@ -1,5 +1,6 @@
 """Any model on any source of frames, as a table of one line: `poem eval --dataset PATH --checkpoint DIR`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from poem_jax.data.frames import FrameSource
@@ -9,7 +10,7 @@ from poem_jax.evaluation.systems import Network
 from poem_jax.mixture.recognise import Kind, recognise, source_at
 from poem_jax.tables.result import Line, TableResult
 from poem_jax.tables.row import AT_20_MM, AT_50_MM, OFFICIAL
-from poem_jax.tables.run import notes_of
+from poem_jax.tables.run import notes_of, root_in_words
 from poem_jax.weights.store import SHIPPED, load
 
 _COLUMNS = (*dict.fromkeys((*AT_20_MM, *AT_50_MM, "f_5", "f_15")),)
@@ -44,7 +45,7 @@ def open_path(path: str, kind: Kind | None, *, split: str | None, mano: Path | N
 
 
 def score_path(source: FrameSource, checkpoint: Path | None, settings: SetSettings) -> TableResult:
-    """Score a model on a source.
+    """Score a model on a source; by the protocol of HO-3D every image counts, as in its official evaluation.
 
     Args:
         source: opened by `open_path`.
@@ -55,6 +56,7 @@ def score_path(source: FrameSource, checkpoint: Path | None, settings: SetSettin
         FileNotFoundError, ValueError: no such model, or no sample can be used.
     """
     weights = SHIPPED if checkpoint is None else checkpoint
+    settings = replace(settings, each_view=settings.each_view or settings.protocol == "ho3d")
     scores = score_set(Network(*load(weights)), source, settings)
     wanted = OFFICIAL if scores.protocol == "ho3d" else _COLUMNS
     columns = tuple(name for name in wanted if name in scores.rows)
@@ -69,7 +71,7 @@ def score_path(source: FrameSource, checkpoint: Path | None, settings: SetSettin
         what={
             "cameras": cameras_in_words(settings.cameras),
             "protocol": scores.protocol,
-            "root": "the true one" if settings.given_root else "the system's own",
+            "root": root_in_words(scores),
         },
         notes=tuple(notes_of(scores)),
     )

@@ -18,8 +18,8 @@ class Line(NamedTuple):
     """None: it did not run."""
     spread: Mapping[str, float] = {}
     """Standard errors of `ours`."""
-    ranks: Mapping[str, str] = {}
-    """Places among the lines of its group, each in words; shown beside the numbers."""
+    beside: Mapping[str, str] = {}
+    """Further columns in words, such as its place among the lines of its group."""
     number: int | None = None
     samples: int | None = None
     """That were scored."""

@@ -15,13 +15,13 @@ AT_20_MM = (
 )
 """Columns of the paper's wide tables."""
 AT_50_MM = tuple(name.replace("_20", "_50") for name in AT_20_MM)
-"""The same for HO3D-Mv, and for v2 where the paper prints it."""
+"""The same for HO3D-Mv."""
 OFFICIAL = ("pa_mpjpe_mm", "pa_auc_j_50", "pa_mpvpe_mm", "pa_auc_v_50", "pa_f_5", "pa_f_15")
 """Of HO-3D's official evaluation; all after Procrustes alignment."""
 SHORT = ("mpvpe_mm", "pa_mpvpe_mm", "mpjpe_mm", "pa_mpjpe_mm")
 AS_POEM, AS_PREDICTED = "poem-release", "poem"
 """The protocols of POEM's tables. MPJPE of POEM is of joints regressed from the mesh; that of the baselines
-of the joints that they predict, against the annotated ones."""
+and of key-point fits of the joints that they predict, against the annotated ones."""
 
 
 @dataclass(frozen=True)

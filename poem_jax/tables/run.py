@@ -138,7 +138,12 @@ def _line(table: str, row: Row, opened: _Opened, settings: RunSettings, files: l
         ours=scores.means if scores.keys else None,
         spread=scores.standard_errors if scores.keys else {},
         samples=len(scores.keys),
-        what={**line.what, "data": data.where, "protocol": scores.protocol},
+        what={
+            **line.what,
+            "data": data.where,
+            "protocol": scores.protocol,
+            "root": root_in_words(scores),
+        },
         notes=tuple(notes),
     )
 
@@ -184,9 +189,23 @@ def _system_in_words(row: Row, opened: _Opened) -> str:
             return ""
 
 
+def root_in_words(scores: SetScores) -> str:
+    """Say whose root the system worked about, sample by sample."""
+    given, of = scores.num_roots_given, scores.num_samples
+    if given == 0:
+        return "the system's own"
+    return (
+        "the true one" if given == of else f"the true one in {given} of {of} samples, else the system's own"
+    )
+
+
 def notes_of(scores: SetScores) -> list[str]:
     """Say what a reader of the numbers must know of how they came about."""
     notes = [_JOINTS_ALONE] if scores.joints_alone else []
+    if scores.num_cut:
+        notes.append(
+            f"of {scores.num_cut} samples the system saw fewer views than these: it takes no more at a time"
+        )
     if scores.unsolved:
         notes.append(f"{scores.unsolved} samples, in which no hand was found, are in no mean")
     if scores.left_out:

@@ -19,6 +19,7 @@ from poem_jax.evaluation.captures import (
     CaptureScores,
     mean_hands,
     mean_hands_rotated,
+    primary_cameras,
     score_captures,
     score_hands,
     truth_of,
@@ -42,6 +43,7 @@ from poem_jax.tables.result import Line, RunSettings, TableResult
 from poem_jax.tables.row import AT_50_MM
 from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.tables.training_summary import Training, training_of
+from poem_jax.typing import Float
 from poem_jax.weights.store import SHIPPED, load
 
 SEEDS = (0, 1)
@@ -156,7 +158,7 @@ _NOTES = (
     "docs/tables.md. Query vectors begin as sines of the template, which is not the paper's; one row begins "
     "without.",
     "Seeds are of the first weights, and in v1 of the basis points that training draws, not of the captures. "
-    "± is the standard error over frames of the mean over seeds; what each seed gives stands below. The "
+    "± is the standard error over frames of the mean over seeds; what each seed gives stands beside it. The "
     "paper's rank is by MPVPE on DexYCB-Mv with 8 cameras, of the systems that it has there; its v2 was "
     "trained on six sets with cameras in random order, the others on DexYCB-Mv alone.",
 )
@@ -190,18 +192,18 @@ class SyntheticTable:
         for condition in tqdm(CONDITIONS, unit="condition", desc=self.name, disable=not settings.progress):
             if condition.rig is not rig:
                 rig, captures = condition.rig, frames_of(condition.rig, samples)
-            score = partial(
-                score_captures,
-                captures=captures,
-                num_views=condition.num_views,
-                batch_size=settings.batch_size,
-                change=condition.change,
-                seed=settings.seed,
-            )
+            given = {
+                "captures": captures,
+                "num_views": condition.num_views,
+                "batch_size": settings.batch_size,
+                "change": condition.change,
+                "seed": settings.seed,
+            }
+            score = partial(score_captures, **given)
             asked = condition.in_words(samples, settings.batch_size, settings.seed)
             question = Question(asked, marks_of(captures))
             of_fit, _ = fitted.scores(first_stage, Training(), question, partial(score, fitting))
-            baselines = _baselines(captures, of_fit)
+            baselines = _baselines(captures, primary_cameras(**given), of_fit)
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             for system in TRAINED:
                 seeds = {
@@ -312,7 +314,7 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
             "of the paper's systems (in the paper)": _beside(line.label, of_paper),
             "paper's rank": _place(paper, in_paper),
         }
-        result.append(line._replace(ranks=ranks))
+        result.append(line._replace(beside={**line.beside, **ranks}))
     return result
 
 
@@ -330,10 +332,14 @@ def _beside(name: str, numbers: Mapping[str, tuple[float, float]]) -> str:
     return f"{_place(error, ours)} ({papers.index(paper) + 1})"
 
 
-def _baselines(captures: Sequence[MultiViewBatch], fitted: CaptureScores) -> dict[str, CaptureScores]:
+def _baselines(
+    captures: Sequence[MultiViewBatch],
+    T_primary_from_world: Float[np.ndarray, "sample 4 4"],
+    fitted: CaptureScores,
+) -> dict[str, CaptureScores]:
     truth = truth_of(captures)
     return {
-        MEAN: CaptureScores(score_hands(mean_hands(captures), truth)),
+        MEAN: CaptureScores(score_hands(mean_hands(captures, T_primary_from_world), truth)),
         MEAN_ROTATED: CaptureScores(score_hands(mean_hands_rotated(captures), truth)),
         FITTING: fitted,
     }
@@ -359,13 +365,15 @@ def _line(
         return line
     by_frame = {name: np.mean([one.rows[name] for one in scores], axis=0) for name in scores[0].rows}
     unsolved = sum(one.unsolved for one in scores)
-    each = ", ".join(
-        f"{seed}: {one.rows[ERROR].mean():.2f}" for seed, one in zip(seeds, scores, strict=False)
-    )
+    of_seeds = {
+        f"MPVPE, seed {seed}": f"{one.rows[ERROR].mean():.2f}"
+        for seed, one in zip(seeds, scores, strict=False)
+    }
     return line._replace(
         ours={name: float(values.mean()) for name, values in by_frame.items()},
         spread={name: standard_error(values) for name, values in by_frame.items()},
         samples=samples,
-        what={"MPVPE of each seed": each, "cameras": condition.title, "protocol": PROTOCOL},
+        beside=of_seeds,
+        what={"cameras": condition.title, "protocol": PROTOCOL},
         notes=(f"{unsolved} frames, in which no hand was found, count as they came",) if unsolved else (),
     )

@@ -58,8 +58,24 @@ def test_any_model_on_a_capture_whose_labels_are_joints_alone(capture, tmp_path,
     (row,) = json.loads((tmp_path / "r.json").read_text())["rows"]
     assert row["samples"] == 1
     assert row["how"]["cameras"] == "the first 3"
+    assert row["how"]["root"] == "the system's own"
     assert row["ours"]["mpjpe_mm"] > 0
     assert "mpvpe_mm" not in row["ours"]
+
+
+def test_a_dataset_row_says_whose_root_it_was_and_counts_as_its_protocol_does(capture, tmp_path) -> None:
+    save(tmp_path / "ckpt", MICRO, init(MICRO, key=jax.random.key(0)))
+    file = tmp_path / "r.json"
+    arguments = ["eval", "--dataset", str(capture), "--checkpoint", str(tmp_path / "ckpt"), "--no-progress"]
+    arguments += ["--batch-size", "1", "--json", str(file)]
+    for more, root, samples in (
+        (["--views", "1"], "the true one", 1),  # one view does not fix it
+        (["--views", "3", "--given-root"], "the true one", 1),
+        (["--views", "3", "--protocol", "ho3d"], "the system's own", 3),  # every image counts
+    ):
+        assert main([*arguments, *more]) == 0
+        (row,) = json.loads(file.read_text())["rows"]
+        assert (row["how"]["root"], row["samples"]) == (root, samples)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from poem_jax.batch import MultiViewBatch, Prediction
+from poem_jax.data.augmentation_recipes import NONE
 from poem_jax.evaluation.benchmark import (
     BenchmarkSettings,
     Reconstructions,
@@ -12,8 +13,10 @@ from poem_jax.evaluation.benchmark import (
     run_benchmark,
 )
 from poem_jax.evaluation.metrics import evaluate
+from poem_jax.evaluation.systems import Answer
 from poem_jax.geometry.cameras import Cameras, project
 from poem_jax.geometry.transforms import rigid, rotation_from_axis_angle
+from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import NUM_JOINTS, NUM_QUERIES, NUM_VERTICES, ROOT_JOINT
 
 HW = (32, 32)
@@ -87,7 +90,9 @@ def test_a_padded_last_batch_changes_nothing(results: dict[int, Scores]) -> None
     padded = run(views=(2, 4), samples=6, batch_size=4)
     for n, scores in results.items():
         assert padded[n]["samples"] == scores["samples"] == 6
-        for name in scores.keys() - {"unsolved", "dlt_2px_root_error_mm"}:
+        without = {name for name, value in scores.items() if value is None}
+        assert without == {"fit_mpvpe_mm", "median_fit_mpvpe_mm"}
+        for name in scores.keys() - {"unsolved", "dlt_2px_root_error_mm"} - without:
             np.testing.assert_allclose(padded[n][name], scores[name], rtol=1e-6, err_msg=name)
         # Triangulation runs in float32 and batches of another size round differently.
         name = "dlt_2px_root_error_mm"
@@ -101,6 +106,22 @@ def test_the_metrics_are_those_of_evaluate(results: dict[int, Scores]) -> None:
     expected = evaluate(joints + shift, joints, vertices + shift, vertices, protocol="poem")
     for name, value in expected.items():
         np.testing.assert_allclose(results[4][name], value, rtol=1e-6, err_msg=name)
+
+
+def test_the_fit_stands_beside_where_views_suffice_for_it() -> None:
+    class Fit:
+        hand, image_hw, recipe = default_hand(), HW, NONE
+        least_views, most_views, takes_root, one_at_a_time = 4, None, False, False
+
+        def __call__(self, batch, seen):
+            shift = np.array([0.005, 0, 0], np.float32)
+            return Answer(batch.joints_world, batch.vertices_world + shift, np.ones(len(batch.views), bool))
+
+    settings = BenchmarkSettings(views=(2, 4), samples=5, batch_size=3, progress=False)
+    scores = run_benchmark(predict_shifted, MadeUpCaptures(), settings, fitting=Fit())
+    for name in ("fit_mpvpe_mm", "median_fit_mpvpe_mm"):
+        assert scores[2][name] is None
+        np.testing.assert_allclose(scores[4][name], 5, rtol=1e-3)
 
 
 def test_unsolved_samples_are_counted(results: dict[int, Scores]) -> None:

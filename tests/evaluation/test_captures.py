@@ -10,6 +10,7 @@ from poem_jax.evaluation.captures import (
     batches_of,
     mean_hands,
     mean_hands_rotated,
+    primary_cameras,
     score_captures,
     score_hands,
     truth_of,
@@ -86,8 +87,20 @@ def test_shuffled_cameras_are_the_same_for_all_and_other_ones_by_another_seed(ca
     assert (order(0) != np.arange(5)).any()
 
 
+def test_the_primary_camera_is_the_first_that_a_system_is_given(captures):
+    of_all = np.stack([one.cameras.T_cam_from_world for one in captures])
+    np.testing.assert_array_equal(primary_cameras(captures, 3, batch_size=2), of_all[:, 0])
+    how = {"batch_size": 2, "change": shuffle_cameras, "seed": 3}
+    shuffled = primary_cameras(captures, 5, **how)
+    batches = [one for one in batches_of(captures, 5, **how)]
+    given = np.concatenate([one.cameras.T_cam_from_world[one.sample_mask, 0] for one in batches])
+    np.testing.assert_array_equal(shuffled, given)
+    assert (shuffled != of_all[:, 0]).any()
+
+
 def test_mean_hands_have_the_true_root_and_one_shape(captures):
-    truth, constant, rotated = truth_of(captures), mean_hands(captures), mean_hands_rotated(captures)
+    first = primary_cameras(captures, 5, batch_size=4)
+    truth, constant, rotated = truth_of(captures), mean_hands(captures, first), mean_hands_rotated(captures)
     for hands in (constant, rotated):
         np.testing.assert_allclose(hands.joints[:, ROOT_JOINT], truth.joints[:, ROOT_JOINT], atol=1e-6)
         sizes = np.linalg.norm(hands.vertices - hands.joints[:, ROOT_JOINT, None], axis=-1)

@@ -15,6 +15,7 @@ from poem_jax.evaluation.systems import Answer, Network
 from poem_jax.hand.model import mirror
 from poem_jax.hand.template import default_hand
 from poem_jax.hand.topology import ROOT_JOINT
+from poem_jax.tables.run import notes_of
 from tests.mixture.fake_frames import FakeFrames
 from tests.tables.numpy_errors import error_mm
 
@@ -95,7 +96,16 @@ def test_one_shape_of_batch_serves_all_samples_and_padding_does_not_count() -> N
     assert [bool(batch.sample_mask.all()) for batch in system.batches] == [True, True, False]
     assert {len(one.views) for one in system.seen} <= {2, 3}
     assert scores.means["mpvpe_mm"] < 5
-    assert not score_set(Known(most_views=2), FakeFrames(length=1, views=4), QUIET).left_out
+
+
+def test_views_that_a_system_has_no_room_for_are_told() -> None:
+    scores = score_set(Known(most_views=2), FakeFrames(length=3, views=4), QUIET)
+    assert not scores.left_out
+    assert scores.num_cut == 3
+    assert "of 3 samples the system saw fewer views" in notes_of(scores)[0]
+    two = replace(QUIET, cameras=FixedViews(2))
+    assert score_set(Known(most_views=2), FakeFrames(length=3, views=4), two).num_cut == 0
+    assert score_set(Known(), FakeFrames(length=3, views=4), QUIET).num_cut == 0
 
 
 def test_cameras_are_drawn_from_the_seed_alone() -> None:
@@ -112,7 +122,9 @@ def test_cameras_are_drawn_from_the_seed_alone() -> None:
 
 def test_the_root_is_given_to_single_views_and_where_it_is_asked_for() -> None:
     def roots(system: Known, **changes) -> np.ndarray:
-        score_set(system, FakeFrames(length=2), replace(QUIET, **changes))
+        scores = score_set(system, FakeFrames(length=2), replace(QUIET, **changes))
+        assert scores.num_samples == 2
+        assert scores.num_roots_given == np.isfinite(system.roots).all(-1).sum()
         return np.array(system.roots)
 
     assert np.isnan(roots(Known())).all()
@@ -155,6 +167,8 @@ def test_images_count_once_each_where_every_view_is_scored() -> None:
     np.testing.assert_allclose(np.ptp(scores.rows["mpvpe_mm"].reshape(2, 3), axis=1), 0, atol=2e-2)
     frame = FakeFrames()[0]
     np.testing.assert_allclose(told[1].vertices_cam, frame.vertices_cam[1], atol=0.02)
+    lost = Known(unsolved=frozenset({"take/000001"}))
+    assert score_set(lost, FakeFrames(length=2), replace(QUIET, each_view=True)).unsolved == 3
 
 
 def view_names() -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from poem_jax.synthetic.dataset import SyntheticDataset
 from poem_jax.weights.store import shipped
 
 SEED, SAMPLES, VIEWS = 987654, 64, 4
-"""Of the captures, on which no model was trained or chosen."""
+"""Of the captures, on which no model was trained."""
 MAX_MPVPE_MM = 7.4
 """On these captures; 7.22 when it was set. Better weights lower it."""
 

@@ -13,7 +13,7 @@ from poem_jax.miniatures.mano_stand_in import write_mano
 from poem_jax.miniatures.names import WRITERS
 from poem_jax.models.apply import init
 from poem_jax.models.config import ModelConfig
-from poem_jax.models.poem_v1_config import PoemV1Config
+from poem_jax.models.poem_v1_config import PoemV1Config, TokenDecoderConfig
 from poem_jax.models.presets import preset
 from poem_jax.tables.places import Places
 from poem_jax.typing import Params
@@ -63,5 +63,7 @@ def in_reach(config: ModelConfig) -> ModelConfig:
     """Let the grids before POEM v1's cameras reach the hands of miniatures, 0.5 to 0.9 m away."""
     if not isinstance(config, PoemV1Config):
         return config
-    frustum = replace(config.basis.frustum, num_depths=16, start=0.3, end=1.1)
+    # Tokens have their channels shared out to the depths.
+    num_depths = 2 if isinstance(config.decoder, TokenDecoderConfig) else 16
+    frustum = replace(config.basis.frustum, num_depths=num_depths, start=0.3, end=1.1)
     return replace(config, basis=replace(config.basis, frustum=frustum))

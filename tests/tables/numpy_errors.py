@@ -21,3 +21,10 @@ def area(found: np.ndarray, truth: np.ndarray, limit_mm: float, steps: int) -> f
     limits = np.linspace(0, limit_mm, steps)
     right = np.array([(apart <= limit).mean() for limit in limits])
     return float(((right[1:] + right[:-1]) / 2).mean())
+
+
+def f_score(found: np.ndarray, truth: np.ndarray, limit_mm: float) -> float:
+    """Of the points near any point of the other hand, both ways."""
+    apart = 1000 * np.linalg.norm(found[:, None] - truth[None], axis=-1)
+    precision, recall = ((apart.min(axis) < limit_mm).mean() for axis in (1, 0))
+    return float(2 * precision * recall / max(precision + recall, 1e-12))

@@ -26,7 +26,7 @@ RESULT = TableResult(
     (
         line(
             "base",
-            (6, 4, 5, 3),
+            (6.5, 4, 5, 3),
             (7.25, 5, 6, 4),
             spread={"mpvpe_mm": 0.125},
             samples=31,
@@ -50,9 +50,9 @@ def test_markdown_has_the_papers_number_beside_ours() -> None:
     text = as_markdown(RESULT)
     rows = rows_of(text)
     assert rows["method"][2:6] == ["MPVPE", "PA-V", "MPJPE", "PA-J"]
-    assert rows["base"][2:] == ["7.25 (6.00)", "5.00 (4.00)", "6.00 (5.00)", "4.00 (3.00)", "0.12", "31"]
-    assert rows["% degrade"][2:4] == ["100 (100)", "0 (100)"]
-    assert rows["absent"][2] == "- (9.00)"
+    assert rows["base"][2:] == ["7.25 (6.5)", "5.00 (4)", "6.00 (5)", "4.00 (3)", "0.12", "31"]
+    assert rows["% degrade"][2:4] == ["100 (85)", "0 (100)"]
+    assert rows["absent"][2] == "- (9.0)"
     assert rows["absent too"][2] == "-"
     assert text.count("put it there") == 1
     assert "3 samples in no mean" in text
@@ -67,7 +67,10 @@ def test_json_has_every_number_and_what_is_missing(tmp_path) -> None:
     assert [path.rpartition("/")[2] for path in paths] == ["mini.md", "mini.json"]
     rows = json.loads((tmp_path / "mini.json").read_text())["rows"]
     assert rows[0]["ours"]["mpvpe_mm"] == 7.25
-    assert rows[0]["paper"]["mpvpe_mm"] == 6
+    assert rows[0]["paper"]["mpvpe_mm"] == 6.5
+    assert rows[0]["degrade_percent"] is None
+    assert rows[1]["degrade_percent"]["ours"]["mpvpe_mm"] == 100
+    assert rows[1]["degrade_percent"]["paper"]["pa_mpvpe_mm"] == 100
     assert rows[2]["ours"] is None
     assert rows[2]["absent"] == ["put it there"]
     assert "](mini.png)" in (tmp_path / "mini.md").read_text()
@@ -93,7 +96,7 @@ def test_curves_are_of_series_with_two_numbers_of_views() -> None:
     curves = curves_of(RESULT.lines)
     assert list(curves) == ["s"]
     assert curves["s"]["ours"] == [(2, 14.5), (8, 7.25)]
-    assert curves["s"]["paper"] == [(2, 12), (8, 6)]
+    assert curves["s"]["paper"] == [(2, 12), (8, 6.5)]
     assert curves_of(RESULT.lines[:1]) == {}
 
 

@@ -13,8 +13,9 @@ import pytest
 from poem_jax.evaluation.systems import Network
 from poem_jax.experiments.synthetic_benchmark import benchmark
 from poem_jax.experiments.synthetic_table import configs
-from poem_jax.models.apply import init
+from poem_jax.models.apply import apply, init
 from poem_jax.models.presets import TINY
+from poem_jax.synthetic.table_rigs import RING
 from poem_jax.tables import synthetic
 from poem_jax.tables.all_tables import table_named
 from poem_jax.tables.layout import as_markdown, write_table
@@ -25,7 +26,8 @@ from poem_jax.tables.synthetic import FITTING, MEAN_ROTATED, NOT_FAR_ENOUGH, TRA
 from poem_jax.tables.synthetic_models import TABLE_MODELS
 from poem_jax.weights.store import save
 from tests.evaluation.test_captures import SMALL, Shifted
-from tests.tables.test_kept_scores import planted_model
+from tests.tables.conftest import shaken
+from tests.tables.numpy_errors import aligned, error_mm
 
 MAKEFILE = Path(__file__).resolve().parents[2] / "Makefile"
 SHIFTS = {"v1-0": 4.0, "v1-1": 6.0, "mvp-1": 300.0, "pe-meshtr-0": np.nan}
@@ -51,12 +53,15 @@ def results(tmp_path_factory):
     """The table, the same made again, and once more where no checkpoint is."""
     places = Places(*(tmp_path_factory.mktemp(name) for name in ("data", "checkpoints", "runs")))
     for name in SHIFTS:
-        planted_model(places.checkpoints / synthetic.FOLDER / name)
+        folder = places.checkpoints / synthetic.FOLDER / name
+        folder.mkdir(parents=True)
+        (folder / "seal.json").write_text(name)
     log = places.runs / "synthetic_table_v1-1"
     log.mkdir()
     (log / "metrics.jsonl").write_text(json.dumps(LOG_LINE) + "\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "CAPTURES", SMALL)
+        patch.setattr(synthetic, "checksum_of_first_stage", lambda params: "the shipped one")
         patch.setattr(synthetic, "load", lambda folder, expected=TINY: (expected, Path(folder)))
         patch.setattr(synthetic, "Network", lambda config, folder: ScoredOnce(SHIFTS[folder.name]))
         patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: ScoredOnce(1.0))
@@ -81,7 +86,7 @@ def test_without_checkpoints_it_is_made_of_kept_scores_and_says_so(results):
     first, _, without = results
     for line, kept in zip(first.lines, without.lines, strict=True):
         same = {key: words for key, words in kept.what.items() if key != "weights gone, scores kept"}
-        assert (kept.ours, kept.spread, kept.ranks, same) == (line.ours, line.spread, line.ranks, line.what)
+        assert (kept.ours, kept.spread, kept.beside, same) == (line.ours, line.spread, line.beside, line.what)
     line = line_of(without, "ring, 8 cameras", "POEM v1")
     assert not line.absent
     for seed in (0, 1):
@@ -117,7 +122,7 @@ def test_every_system_stands_in_every_condition(result):
 def test_numbers_are_means_over_frames_and_seeds(result):
     line = line_of(result, "front, 5 cameras", "POEM v1")
     np.testing.assert_allclose(line.ours["mpvpe_mm"], 5.0, rtol=1e-3)
-    assert line.what["MPVPE of each seed"] == "0: 4.00, 1: 6.00"
+    assert [line.beside[f"MPVPE, seed {seed}"] for seed in (0, 1)] == ["4.00", "6.00"]
     assert line.what["training"] == "1: 50 steps, training MPVPE 81 to 80.6 mm, 0.5 h"
     assert line.samples == 3
     assert not line.absent
@@ -141,7 +146,7 @@ def test_it_is_written_and_drawn_like_the_papers(result, tmp_path):
     assert {Path(path).name for path in paths} == {"synthetic.md", "synthetic.json"}
     rows = json.loads((tmp_path / "synthetic.json").read_text())["rows"]
     (row,) = [row for row in rows if (row["label"], row["data"]) == ("POEM v1", "corners, 4 cameras")]
-    assert row["ranks"]["paper's rank"] == "1 of 8"
+    assert row["beside"]["paper's rank"] == "1 of 8"
     assert [point.num_views for point in curves_of(result.lines)["POEM v1"]["ours"]] == [2, 4, 8]
     write_picture(tmp_path / "synthetic.png", result)
     assert (tmp_path / "synthetic.png").stat().st_size > 1000
@@ -151,16 +156,54 @@ def test_a_system_worse_than_the_turned_mean_hand_has_no_rank(result):
     line = line_of(result, "ring, 8 cameras", "MvP")
     assert line.ours["mpvpe_mm"] > line_of(result, "ring, 8 cameras", MEAN_ROTATED).ours["mpvpe_mm"]
     assert NOT_FAR_ENOUGH in line.notes
-    assert line.ranks["rank"] == ""
-    assert line.ranks["paper's rank"] == "8 of 8"
+    assert line.beside["rank"] == ""
+    assert line.beside["paper's rank"] == "8 of 8"
 
 
 def test_ranks_stand_beside_the_numbers(result):
     _, table = as_markdown(result).split("## ring, 8 cameras\n\n", 1)
     head, _, *rows = table.split("\n\n")[0].splitlines()
-    assert head.endswith("| samples | rank | of the paper's systems (in the paper) | paper's rank |")
+    assert head.endswith(
+        "| samples | rank | of the paper's systems (in the paper) | paper's rank "
+        "| MPVPE, seed 0 | MPVPE, seed 1 |"
+    )
     (row,) = [row for row in rows if row.startswith("|  | POEM v1 ")]
-    assert row.endswith("| 3 | 1 of 1 | 1 of 1 (1) | 1 of 8 |")
+    assert row.endswith("| 3 | 1 of 1 | 1 of 1 (1) | 1 of 8 | 4.00 | 6.00 |")
+
+
+@pytest.mark.slow
+def test_a_networks_row_is_numpys(tmp_path, monkeypatch):
+    """From the table's own folder of checkpoints, of its own config, by the library's `apply` alone."""
+    places = Places(tmp_path, tmp_path / "checkpoints")
+    system = next(one for one in TRAINED if one.name == "v2")
+    config = TABLE_MODELS["v2"]
+    params = shaken(init(config, key=jax.random.key(0)))
+    save(system.folder(places, 0), config, params)
+    monkeypatch.setattr(synthetic, "CAPTURES", replace(SMALL, image_hw=config.image_hw))
+    monkeypatch.setattr(synthetic, "CONDITIONS", (synthetic.Condition(RING, 4),))
+    settings = RunSettings(str(tmp_path / "out"), samples=2, batch_size=2, progress=False)
+    result = table_named("synthetic").run(places, settings)
+    line, fitted = (line_of(result, "ring, the first 4 cameras", label) for label in ("POEM v2", FITTING))
+    captures = synthetic.frames_of(RING, 2)
+    rows = []
+    for one in captures:
+        cameras = type(one.cameras)(*(leaf[None, :4] for leaf in one.cameras))
+        found = jax.device_get(apply(params, one.views[None, :4], cameras, config=config))
+        joints, vertices = found.joints_world[0].astype(float), found.vertices_world[0].astype(float)
+        true_joints, truth = one.joints_world.astype(float), one.vertices_world.astype(float)
+        rows.append(
+            [
+                error_mm(vertices, truth),
+                error_mm(vertices - joints[0], truth - true_joints[0]),
+                error_mm(aligned(vertices, truth), truth),
+                error_mm(joints, true_joints),
+                error_mm(aligned(joints, true_joints), true_joints),
+            ]
+        )
+    names = ("mpvpe_mm", "rr_mpvpe_mm", "pa_mpvpe_mm", "mpjpe_mm", "pa_mpjpe_mm")
+    for name, expected in zip(names, np.mean(rows, axis=0), strict=True):
+        assert line.ours[name] == pytest.approx(expected, rel=2e-3), name
+    assert 0 < fitted.ours["mpvpe_mm"] < 40
 
 
 def test_a_folder_that_holds_another_system_is_not_scored(tmp_path):
@@ -189,7 +232,7 @@ def test_ranks_are_by_error_and_baselines_have_none():
         ]
     )
     names = ("rank", "of the paper's systems (in the paper)", "paper's rank")
-    ranks = {one.label: tuple(one.ranks[name] for name in names) for one in lines}
+    ranks = {one.label: tuple(one.beside[name] for name in names) for one in lines}
     assert ranks == {
         MEAN_ROTATED: ("", "", ""),
         FITTING: ("", "", ""),
