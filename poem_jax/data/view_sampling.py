@@ -36,7 +36,8 @@ class ViewSampling(Protocol):
 
 @dataclass(frozen=True)
 class UniformViews:
-    """The paper's rule: each number of views from `min` to `max` as often, in random order."""
+    """Each number of views from `min` to `max` as often, in random order (the paper says no more than that
+    they are drawn at random)."""
 
     min: int = 1
     max: int | None = None

@@ -90,6 +90,8 @@ class _Rows(NamedTuple):
     """NaN for a model that takes no root."""
     vertices_fitted: np.ndarray
     """NaN where there is no fit to compare with."""
+    fitted: np.ndarray
+    """False where the fit says that it found no hand."""
     valid: np.ndarray
     dlt_root: np.ndarray
 
@@ -145,9 +147,9 @@ def run_benchmark(
 
     Returns: per view count the metrics of `evaluate`, and `median_mpvpe_mm`, `mpvpe_true_root_mm` and its
     `median_`, `root_error_mm`, `dlt_2px_root_error_mm`, `mean_pose_mpvpe_mm`, `mean_pose_rotated_mpvpe_mm`,
-    `fit_mpvpe_mm` and its `median_`, `samples` and `unsolved` (samples that the model itself calls invalid;
-    they count in all errors). Errors of a root that the model does not have, with a true root that it does
-    not take, or of a fit that there is not are None.
+    `fit_mpvpe_mm`, its `median_` and `fit_unsolved`, `samples` and `unsolved` (samples that fit or model
+    itself calls invalid; they count in all errors). Errors of a root that the model does not have, with a
+    true root that it does not take, or of a fit that there is not are None.
 
     Raises:
         ValueError: a prediction that is not finite.
@@ -224,6 +226,7 @@ def _row(
         root=no_root if found.root_world is None else _float64(found.root_world),
         vertices_given=np.full_like(vertices, np.nan) if given is None else _float64(given.vertices_world),
         vertices_fitted=np.full_like(vertices, np.nan) if fitted is None else _float64(fitted.vertices_world),
+        fitted=np.zeros(len(vertices), bool) if fitted is None else np.asarray(fitted.valid),
         valid=np.asarray(found.valid),
         dlt_root=noisy_dlt_roots(root_px, K, T_cam_from_world, noise),
     )
@@ -263,6 +266,7 @@ def _scores(rows: _Rows, truth: _Truth, protocol: str, hand: HandModel | None) -
         "mean_pose_rotated_mpvpe_mm": float(rotated.mean()),
         "fit_mpvpe_mm": _known(np.mean(fitted)),
         "median_fit_mpvpe_mm": _known(np.median(fitted)),
+        "fit_unsolved": None if np.isnan(fitted).any() else int((~rows.fitted).sum()),
         "samples": len(found),
         "unsolved": int((~rows.valid).sum()),
     }

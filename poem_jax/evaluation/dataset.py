@@ -91,7 +91,7 @@ class SetScores(NamedTuple):
     num_roots_given: int
     """Samples of which it was given the true root."""
     num_cut: int
-    """Samples of which it saw fewer views than the rule takes, for it takes no more."""
+    """Samples of which it saw fewer views than the rule would have drawn, had it had room for them."""
 
     @property
     def means(self) -> dict[str, float]:
@@ -257,7 +257,7 @@ def _read(system: System, source: FrameSource, settings: SetSettings, index: int
     sample = augment(frame, views, system.recipe, system.image_hw, np.random.default_rng(0))
     root = sample.joints_world[ROOT_JOINT] if knows_root else np.full(3, np.nan, np.float32)
     sample = sample._replace(pose=None, shape=None, root_world=root)
-    return _Read(index, sample, Seen(frame, views), knows_root, len(wanted) > most)
+    return _Read(index, sample, Seen(frame, views), knows_root, len(views) < len(wanted))
 
 
 def _batch(group: Sequence[_Read], size: int, most: int) -> MultiViewBatch:

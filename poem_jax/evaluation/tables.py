@@ -48,6 +48,7 @@ STAGE_COLUMNS = (
     Column("turned", "mean_pose_rotated_mpvpe_mm"),
     Column("fit", "fit_mpvpe_mm"),
     Column("its median", "median_fit_mpvpe_mm"),
+    Column("not fitted", "fit_unsolved", 0),
     Column("unsolved", "unsolved", 0),
 )
 """Which stage fails: vertex errors with the model's and with the true root, the root's error, baselines."""
@@ -60,7 +61,8 @@ root             error of the root joint that the model triangulates
 DLT 2 px         error of the root triangulated from its true pixels with 2 px of noise
 mean pose        baseline at the true root: the captures' mean mesh in the primary camera's frame
 turned           baseline at the true root: their mean hand, turned by the true global rotation
-fit, its median  baseline: the solver of `poem fit` on the key points of the model's own first stage"""
+fit, its median  baseline: the solver of `poem fit` on the key points of the model's own first stage; where
+                 too few agree ("not fitted") the template posed by all of them"""
 JOINTS_LEGEND = "joint columns: the 21 joints that the model predicts, not joints regressed from its vertices"
 REGRESSED_LEGEND = "joint columns: joints regressed from the vertices of both sides; AUC-J: predicted joints"
 GIVEN_ROOT_LEGEND = (

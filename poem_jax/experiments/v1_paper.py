@@ -2,7 +2,7 @@
 
 What:      all cameras in their own order (DexYCB 8, HO3D 5, OakInk 4); the paper's augmentation; Adam 1e-4, a
            tenth of it after 70 % of 100 epochs of batch 16. The trunk, ResNet-34, starts from ImageNet in the
-           paper: `--train.init-from DIR` with a file that you bring (docs/weights.md).
+           paper: `--train.first-stage-from DIR` with a file that you bring (docs/weights.md).
            The rest by name, MODEL-SET:
            v1, mvp, pe-meshtr, ftl-meshtr on dexycb, oakink, ho3d; v1-1stage on dexycb; v1-wo-proj on all
            three; v1-wo-pt on dexycb, ho3d; v1-g-emb, v1-gv-emb on oakink. v1-1stage wants the mean root of

@@ -3,7 +3,7 @@
 What:      ResNet-34 trunk, width 256, six layers; 8 views a sample; losses of heat maps, triangulated joints
            and every layer; Adam 1e-4, a tenth of it after 70 %, a global clip at 1; batch 16, and as many
            steps as 100 epochs of DexYCB-Mv's 25,387 frames have. The paper starts the trunk from ImageNet:
-           `--train.init-from DIR` (docs/weights.md).
+           `--train.first-stage-from DIR` (docs/weights.md).
 Hardware:  accelerators; every device takes an equal part of the batch (`--data.batches.0.batch-size` shrinks
            it). Neither memory nor speed was measured.
 Time:      not run to its end here.

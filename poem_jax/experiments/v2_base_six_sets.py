@@ -5,8 +5,8 @@ What:      HRNet-W40 trunk, width 256, three layers; 0.18 of the samples from ea
            augmentation; losses on every layer; Adam 1e-4 with a cosine decay; batch 32, 65,625 steps. These
            are 2.1 million samples, ten epochs of 210,000; the paper's "2,100,000 iterations" at batch 32 is
            the other reading: `--train.steps 2100000`. Batch 16: `--data.batches.0.batch-size 16 --train.steps
-           131250`. The trunk starts from ImageNet in the paper: `--train.init-from DIR` with a file that you
-           bring (docs/weights.md).
+           131250`. The trunk starts from ImageNet in the paper: `--train.first-stage-from DIR` with a file
+           that you bring (docs/weights.md).
 Data:      the authors' tars in data/dataset_tars/, or with `v2_base_six_sets:raw` the raw sets in data/raw/
            and MANO (poem_jax/experiments/parts/data_sets.py).
 Hardware:  the paper's: 4 NVIDIA A6000; every device takes an equal part of the batch.

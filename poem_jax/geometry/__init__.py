@@ -1,7 +1,7 @@
 """Differentiable multi-view geometry: pure functions over any leading batch axes.
 
 What maps points, pixels and cameras follows the type of its arrays, NumPy or JAX; triangulation, sampling and
-neighbours are JAX. All work within `jit`, `vmap` and `grad`.
+neighbours are JAX. All work within `jit` and `vmap`, and have gradients, but for the choice of neighbours.
 """
 
 import importlib
@@ -14,6 +14,10 @@ if TYPE_CHECKING:
         crop_homography,
         crop_intrinsics,
         index_homography,
+        mirror_intrinsics,
+        mirror_pixels,
+        mirror_points,
+        mirror_world,
         project,
         unproject,
     )
@@ -31,6 +35,10 @@ _HOME = {
     "gather": "neighbours",
     "index_homography": "cameras",
     "invert_rigid": "transforms",
+    "mirror_intrinsics": "cameras",
+    "mirror_pixels": "cameras",
+    "mirror_points": "cameras",
+    "mirror_world": "cameras",
     "nearest": "neighbours",
     "procrustes": "alignment",
     "project": "cameras",
@@ -52,6 +60,10 @@ __all__ = [
     "gather",
     "index_homography",
     "invert_rigid",
+    "mirror_intrinsics",
+    "mirror_pixels",
+    "mirror_points",
+    "mirror_world",
     "nearest",
     "procrustes",
     "project",

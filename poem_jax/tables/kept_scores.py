@@ -72,7 +72,7 @@ class KeptScores(NamedTuple):
     """What a file holds."""
 
     weights: str
-    """`checksum_of` the model."""
+    """`checksum_of` the model; of a fit, which has none, its settings and first stage in words."""
     first_stage: str
     """`checksum_of_first_stage` of the model that lends it."""
     config: ModelConfig
@@ -101,7 +101,7 @@ class ScoresFile:
         """Return what was kept of the same weights, else score and keep it; and how they were trained.
 
         Args:
-            weights: `checksum_of` the model.
+            weights: what tells the model from others: `KeptScores.weights`.
             training: how it was trained, as far as that is known; kept with the scores.
             question: captures and condition.
             score: computes them.

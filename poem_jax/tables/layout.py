@@ -122,14 +122,14 @@ def _group(title: str, lines: Sequence[Line]) -> list[str]:
     return [f"## {title}", "", *_markdown_rows(head, rows)]
 
 
-def _degrade(line: Line, lines: Sequence[Line]) -> dict[str, dict[str, float]] | None:
+def _degrade(line: Line, lines: Sequence[Line]) -> dict[str, dict[str, float | None]] | None:
     """Return by how much ours and the paper's errors are larger than those of the line that it names, which
     stands in the same group."""
     base = next((one for one in lines if (one.group, one.label) == (line.group, line.against)), None)
     if base is None:
         return None
-    ours = degrade_percent(line.ours or {}, base.ours or {})
-    return {"ours": ours, "paper": degrade_percent(line.paper, base.paper)}
+    ours, paper = degrade_percent(line.ours or {}, base.ours or {}), degrade_percent(line.paper, base.paper)
+    return {"ours": _numbers(ours), "paper": _numbers(paper)}
 
 
 def _printed_decimals(lines: Sequence[Line], column: Column) -> int:

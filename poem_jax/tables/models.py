@@ -39,5 +39,5 @@ def v2(preset: str) -> Checkpoint:
 
 
 def _trained(experiment: str, options: str = "") -> str:
-    start = f"poem train {experiment}{options} --train.init-from IMAGENET"
+    start = f"poem train {experiment}{options} --train.first-stage-from IMAGENET"
     return f"{start}; then the same with --export {{out}}   (IMAGENET: the paper's trunk, docs/weights.md)"

@@ -177,6 +177,7 @@ class SyntheticTable:
         opened = cache(partial(_opened, places))
         config, params = load(SHIPPED)
         fitting, first_stage = FirstStageFitting(config, params), checksum_of_first_stage(params)
+        fit = f"{fitting.settings}, on {first_stage}"
         # A quick look leaves the scores of all frames alone.
         kept_in = Path(settings.out) / (KEPT if samples == TEST_FRAMES else f"{KEPT}_{samples}")
         fitted = ScoresFile(kept_in / FITTED, config, first_stage)
@@ -202,7 +203,7 @@ class SyntheticTable:
             score = partial(score_captures, **given)
             asked = condition.in_words(samples, settings.batch_size, settings.seed)
             question = Question(asked, marks_of(captures))
-            of_fit, _ = fitted.scores(first_stage, Training(), question, partial(score, fitting))
+            of_fit, _ = fitted.scores(fit, Training(), question, partial(score, fitting))
             baselines = _baselines(captures, primary_cameras(**given), of_fit)
             group = [_line(condition, label, [scores], samples) for label, scores in baselines.items()]
             for system in TRAINED:
@@ -314,7 +315,7 @@ def ranked(lines: Sequence[Line]) -> list[Line]:
             "of the paper's systems (in the paper)": _beside(line.label, of_paper),
             "paper's rank": _place(paper, in_paper),
         }
-        result.append(line._replace(beside={**line.beside, **ranks}))
+        result.append(line._replace(beside={**ranks, **line.beside}))
     return result
 
 
@@ -375,5 +376,7 @@ def _line(
         samples=samples,
         beside=of_seeds,
         what={"cameras": condition.title, "protocol": PROTOCOL},
-        notes=(f"{unsolved} frames, in which no hand was found, count as they came",) if unsolved else (),
+        notes=(f"{unsolved} frames, in which the system found no hand, count with what it gave",)
+        if unsolved
+        else (),
     )

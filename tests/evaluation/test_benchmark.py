@@ -91,7 +91,7 @@ def test_a_padded_last_batch_changes_nothing(results: dict[int, Scores]) -> None
     for n, scores in results.items():
         assert padded[n]["samples"] == scores["samples"] == 6
         without = {name for name, value in scores.items() if value is None}
-        assert without == {"fit_mpvpe_mm", "median_fit_mpvpe_mm"}
+        assert without == {"fit_mpvpe_mm", "median_fit_mpvpe_mm", "fit_unsolved"}
         for name in scores.keys() - {"unsolved", "dlt_2px_root_error_mm"} - without:
             np.testing.assert_allclose(padded[n][name], scores[name], rtol=1e-6, err_msg=name)
         # Triangulation runs in float32 and batches of another size round differently.
@@ -115,13 +115,16 @@ def test_the_fit_stands_beside_where_views_suffice_for_it() -> None:
 
         def __call__(self, batch, seen):
             shift = np.array([0.005, 0, 0], np.float32)
-            return Answer(batch.joints_world, batch.vertices_world + shift, np.ones(len(batch.views), bool))
+            valid = np.arange(len(batch.views)) > 0
+            return Answer(batch.joints_world, batch.vertices_world + shift, valid)
 
     settings = BenchmarkSettings(views=(2, 4), samples=5, batch_size=3, progress=False)
     scores = run_benchmark(predict_shifted, MadeUpCaptures(), settings, fitting=Fit())
     for name in ("fit_mpvpe_mm", "median_fit_mpvpe_mm"):
         assert scores[2][name] is None
         np.testing.assert_allclose(scores[4][name], 5, rtol=1e-3)
+    # The first sample of each batch.
+    assert (scores[2]["fit_unsolved"], scores[4]["fit_unsolved"]) == (None, 2)
 
 
 def test_unsolved_samples_are_counted(results: dict[int, Scores]) -> None:

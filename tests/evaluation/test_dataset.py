@@ -106,6 +106,11 @@ def test_views_that_a_system_has_no_room_for_are_told() -> None:
     two = replace(QUIET, cameras=FixedViews(2))
     assert score_set(Known(most_views=2), FakeFrames(length=3, views=4), two).num_cut == 0
     assert score_set(Known(), FakeFrames(length=3, views=4), QUIET).num_cut == 0
+    rule, at_random = UniformViews(2, 4), replace(QUIET, cameras=UniformViews(2, 4))
+    drawn = [len(rule.draw(4, np.random.default_rng((QUIET.seed, index)))) for index in range(9)]
+    scores = score_set(Known(most_views=3), FakeFrames(length=9, views=4), at_random)
+    seen = [len(rule.draw(4, np.random.default_rng((QUIET.seed, index)), 3)) for index in range(9)]
+    assert scores.num_cut == sum(a > b for a, b in zip(drawn, seen, strict=True)) > drawn.count(4)
 
 
 def test_cameras_are_drawn_from_the_seed_alone() -> None:

@@ -71,6 +71,9 @@ def test_prints_the_tables_and_writes_json_by_view_count(experiment, tmp_path, c
     assert results["1"]["mpvpe_mm"] == pytest.approx(results["1"]["mpvpe_true_root_mm"], rel=1e-12)
     assert results["1"]["mean_pose_mpvpe_mm"] == results["2"]["mean_pose_mpvpe_mm"]
     assert np.isfinite(results["2"]["root_error_mm"])
+    assert results["1"]["fit_mpvpe_mm"] is None
+    assert np.isfinite(results["2"]["fit_mpvpe_mm"])
+    assert 0 <= results["2"]["fit_unsolved"] <= 3
     printed = capsys.readouterr().out
     for part in ("MPVPE", "AUC-J@20", "F@15", "mean pose", "3 synthetic captures of seed 5", str(checkpoint)):
         assert part in printed

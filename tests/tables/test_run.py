@@ -289,7 +289,7 @@ def test_main_and_ablation_run_on_all_sets_and_one_row_each_is_numpys(all_places
     ho3d = ReleasedTars(all_places.tars / "HO3D_mv_test", split="test")[0]
     for result, label, group, model, frame in (
         (main, "PE-MeshTR", "OakInk-Mv", "pe-meshtr-oakink", oakink),
-        (main, "FTL-MeshTR", "HO3D-Mv", "ftl-meshtr-ho3d", ho3d),
+        (main, "POEM v1", "HO3D-Mv", "v1-ho3d", ho3d),
         (ablation, "w/o-proj", "OakInk-Mv", "v1-wo-proj-oakink", oakink),
         (ablation, "w/o-pt", "HO3D-Mv", "v1-wo-pt-ho3d", ho3d),
     ):

@@ -48,6 +48,10 @@ class ScoredOnce(Shifted):
         return super().__call__(batch, seen)
 
 
+class Fit(ScoredOnce):
+    settings = "as it is"
+
+
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     """The table, the same made again, and once more where no checkpoint is."""
@@ -64,7 +68,7 @@ def results(tmp_path_factory):
         patch.setattr(synthetic, "checksum_of_first_stage", lambda params: "the shipped one")
         patch.setattr(synthetic, "load", lambda folder, expected=TINY: (expected, Path(folder)))
         patch.setattr(synthetic, "Network", lambda config, folder: ScoredOnce(SHIFTS[folder.name]))
-        patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: ScoredOnce(1.0))
+        patch.setattr(synthetic, "FirstStageFitting", lambda config, folder: Fit(1.0))
         out = str(tmp_path_factory.mktemp("out"))
         settings = RunSettings(out, samples=3, batch_size=3, progress=False)
         elsewhere = replace(places, checkpoints=places.data, runs=places.data)

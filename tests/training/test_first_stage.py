@@ -6,9 +6,12 @@ import jax
 import numpy as np
 import pytest
 
+from poem_jax.experiments import open_experiment, v1_paper
 from poem_jax.models.apply import init
+from poem_jax.models.network import is_of_first_stage
+from poem_jax.models.presets import preset
 from poem_jax.training.first_stage import with_first_stage
-from poem_jax.weights.store import flatten
+from poem_jax.weights.store import expected_leaves, flatten
 from tests.micro import MICRO
 
 
@@ -32,3 +35,21 @@ def test_another_trunk_is_refused_by_name(lent):
     wider = replace(MICRO, backbone=replace(MICRO.backbone, channels=(16, 32)))
     with pytest.raises(ValueError, match=r"donor must have this model.s trunk.*expected \w+\.trunk"):
         with_first_stage(init(wider, key=jax.random.key(2)), lent, "donor")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("of", "experiments"),
+    [
+        ("v1", [f"v1_paper:{name}" for name in v1_paper.configs]),
+        ("v2-base", [f"v2_{size}_six_sets" for size in ("small", "base", "large", "param")]),
+    ],
+)
+def test_one_folder_lends_its_trunk_to_all_that_the_papers_tables_train(of, experiments):
+    """So that an ImageNet trunk is imported once (docs/weights.md)."""
+    lent = expected_leaves(preset(of))
+    for model in {open_experiment(name).model for name in experiments}:
+        wanted = {name: leaf for name, leaf in expected_leaves(model).items() if is_of_first_stage(name)}
+        assert wanted
+        for name, leaf in wanted.items():
+            assert lent[name].shape == leaf.shape, (model, name)
