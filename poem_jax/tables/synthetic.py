@@ -114,7 +114,7 @@ TRAINED = (
     Trained("mvp", "MvP", 9.77),
 )
 FITTING, MEAN, MEAN_ROTATED = (
-    "key points of the first stage, `poem fit`",
+    "`poem fit` to the first stage's points",
     "mean hand, true root",
     "mean hand, true root and rotation",
 )
