@@ -26,7 +26,7 @@ from poem_jax.models.network import is_of_first_stage
 from poem_jax.tables.training_summary import Training
 from poem_jax.typing import Float, Params
 from poem_jax.weights.config_json import from_json, to_json
-from poem_jax.weights.store import CHECKSUMS_FILE, flatten
+from poem_jax.weights.store import CHECKSUMS_FILE, checksum_of_leaves, flatten
 
 _log = logging.getLogger(__name__)
 _ABOUT = "about"
@@ -186,12 +186,9 @@ def checksum_of(model: Path) -> str:
 
 def checksum_of_first_stage(params: Params) -> str:
     """Return a checksum of a model's trunk and heat maps, whatever comes after them."""
-    digest = hashlib.sha256()
-    for name, leaf in sorted(flatten(params).items()):
-        if is_of_first_stage(name):
-            array = np.asarray(leaf)
-            digest.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
-    return digest.hexdigest()
+    return checksum_of_leaves(
+        {name: leaf for name, leaf in flatten(params).items() if is_of_first_stage(name)}
+    )
 
 
 def marks_of(captures: Sequence[MultiViewBatch]) -> Marks:

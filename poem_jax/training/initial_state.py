@@ -1,13 +1,11 @@
 """The state that a sitting begins with, and what the log says of it."""
 
-import hashlib
 import logging
 import os
 import socket
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from poem_jax.models.apply import init
 from poem_jax.training.checkpoints import Checkpoints
@@ -18,7 +16,7 @@ from poem_jax.training.parallel import put_everywhere
 from poem_jax.training.query_start import with_smooth_queries
 from poem_jax.training.state import TrainState, create_state
 from poem_jax.typing import Params
-from poem_jax.weights.store import SHIPPED, flatten, load
+from poem_jax.weights.store import SHIPPED, checksum_of_leaves, flatten, load
 
 log = logging.getLogger(__name__)
 
@@ -62,11 +60,7 @@ def _digest(params: Params) -> str:
     """Return what tells these weights from others; nothing where there is no other host to compare with."""
     if jax.process_count() == 1:
         return ""
-    digest = hashlib.sha256()
-    for name, leaf in sorted(flatten(params).items()):
-        array = np.asarray(leaf)
-        digest.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
-    return digest.hexdigest()
+    return checksum_of_leaves(flatten(params))
 
 
 def _warn_of_idle_gpus() -> None:

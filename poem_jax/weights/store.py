@@ -4,11 +4,12 @@ The config travels with the weights, so that a checkpoint loads without its expe
 temporary folder beside the target, which is renamed when it is whole.
 """
 
+import hashlib
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -130,6 +131,15 @@ def flatten(tree: PyTree) -> dict[str, Array]:
     return {
         name: np.asarray(leaf) if isinstance(leaf, StaticArray) else leaf for name, leaf in leaves.items()
     }
+
+
+def checksum_of_leaves(leaves: Mapping[str, Array]) -> str:
+    """Return what tells named leaves from others: of their names, types, shapes and numbers, in any order."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(leaves.items()):
+        array = np.asarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def unflatten(leaves: dict[str, Array], like: PyTree) -> PyTree:
