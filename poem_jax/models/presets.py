@@ -92,7 +92,7 @@ TINY = Config(
     features=FeatureConfig(stride=4, heat_maps=True),
     basis=BasisConfig(num_points=1024),
     aggregation=AggregationConfig(similarity=Similarity.EQUAL),
-    joint_decoder=JointDecoderConfig(),
+    joint_decoder=JointDecoderConfig(num_layers=3),
     decoder=DecoderConfig(
         num_layers=2,
         num_neighbours=8,

@@ -16,8 +16,8 @@ from poem_jax.weights.store import shipped
 
 SEED, SAMPLES, VIEWS = 987654, 64, 4
 """Of the captures, on which no model was trained."""
-MAX_MPVPE_MM = 7.4
-"""On these captures; 7.22 when it was set. Better weights lower it."""
+MAX_MPVPE_MM = 6.45
+"""On these captures; 6.26 when it was set. Better weights lower it."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_it_has_not_got_worse(errors) -> None:
 @pytest.mark.parametrize("features", ["zero", "another"])
 def test_its_second_stage_reads_the_images(errors, features: str) -> None:
     """On the same captures it is worse by half, at least, without its features, and with those of another
-    capture; by 343 and 241 % when this was written.
+    capture; by 487 and 342 % when this was written.
 
     Zeros never occur in training, so the second says more. A second stage that ignores its features differs
     by nothing, one that ignores whose they are in the first case alone.
@@ -56,10 +56,10 @@ def test_its_second_stage_reads_the_images(errors, features: str) -> None:
 
 
 def test_its_second_stage_gains_on_the_first(errors) -> None:
-    """A quarter, at least, on the template posed by the triangulated joints; 28 % when this was written."""
+    """A third, at least, on the template posed by the triangulated joints; 38 % when this was written."""
     gain = paired_difference(errors.posed, errors.own)
     print(gain)
-    assert gain.mean_mm >= 0.25 * errors.posed.mean()
+    assert gain.mean_mm >= errors.posed.mean() / 3
 
 
 @pytest.mark.slow
