@@ -4,7 +4,7 @@ What:      1 to 8 views of 128 x 128, a kind of batch drawn anew every step. The
            heat maps alone; then all is trained, the second stage about the first one's own root. Absolute
            losses on every layer; averaged weights are evaluated and shipped.
 Hardware:  a GPU beside many CPU cores that draw the captures; the same command uses what it finds.
-Time:      two days on 2 CPU cores, by its rate there; not run to its end. The shipped weights come from five
+Time:      two days on 2 CPU cores, by its rate there; not run to its end. The shipped weights come from six
            sittings by scripts around the same modules (docs/shipped_model.md).
 Expected:  see docs/shipped_model.md (poem eval tiny_synthetic --stages).
 Command:   poem train tiny_synthetic

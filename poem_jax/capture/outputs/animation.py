@@ -23,8 +23,8 @@ from poem_jax.viz.page import HAND_RGB
 
 MAX_SKIN_ERROR_M = 0.008
 """Mean distance of the skinned vertices from those that the engine gave, beyond which these are kept. The
-shipped network's meshes of real hands lie 4.2 to 4.4 mm from a skinned hand that has their joints (6.4 with
-earlier weights), and 11 mm from the hands."""
+shipped network's meshes of real hands lie 4.2 to 4.4 mm from a skinned hand that has their joints (4.7 to 6.4
+with earlier weights), and their joints 11 mm from triangulated ones."""
 _FRAMES_COMPARED = 100
 """Spread over the take."""
 
