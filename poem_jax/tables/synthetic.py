@@ -4,7 +4,7 @@ No number of the paper's is of these captures; what can be compared is the order
 that stays above the mean hand with true root and rotation has not been trained far enough, and has no rank.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -189,6 +189,7 @@ class SyntheticTable:
             for seed in SEEDS
         }
         lines: list[Line] = []
+        gone: dict[str, None] = {}
         rig, captures = None, []
         for condition in tqdm(CONDITIONS, unit="condition", desc=self.name, disable=not settings.progress):
             if condition.rig is not rig:
@@ -212,8 +213,15 @@ class SyntheticTable:
                     for seed in SEEDS
                 }
                 group.append(_line_of_seeds(condition, system, seeds, samples))
+                gone |= {one.absent: None for one in seeds.values() if one.scores and one.absent}
             lines += ranked(group)
-        return TableResult(self.name, self.title, tuple(lines), _NOTES)
+        return TableResult(self.name, self.title, tuple(lines), (*_NOTES, *_note_of_weights(gone)))
+
+
+def _note_of_weights(gone: Iterable[str]) -> tuple[str, ...]:
+    """Say how the models are made again whose scores alone are left."""
+    models = [f"- {how}" for how in gone]
+    return ("\n".join(["Weights gone, scores kept:\n", *models]),) if models else ()
 
 
 table = SyntheticTable()
@@ -259,9 +267,7 @@ def _line_of_seeds(
         "training": "; ".join(
             f"{s}: {seeds[s].training.summary}" for s in scored if seeds[s].training.summary
         ),
-        "weights gone, scores kept": "; ".join(
-            f"{s}: {seeds[s].absent}" for s in scored if seeds[s].absent is not None
-        ),
+        "weights gone, scores kept": ", ".join(f"{s}" for s in scored if seeds[s].absent is not None),
     }
     return line._replace(
         what={**line.what, **{key: words for key, words in said.items() if words}},

@@ -33,6 +33,7 @@ MAKEFILE = Path(__file__).resolve().parents[2] / "Makefile"
 SHIFTS = {"v1-0": 4.0, "v1-1": 6.0, "mvp-1": 300.0, "pe-meshtr-0": np.nan}
 """Millimetres by which the stand-ins of trained systems are wrong; one has diverged."""
 
+GONE = "weights gone, scores kept"
 LOG_LINE = {"group": "train", "step": 50, "steps_per_second": 50 / 1800, "mpvpe_mm": 80.6}
 
 
@@ -89,16 +90,21 @@ def test_made_again_it_is_the_same_and_scores_no_model_anew(results):
 def test_without_checkpoints_it_is_made_of_kept_scores_and_says_so(results):
     first, _, without = results
     for line, kept in zip(first.lines, without.lines, strict=True):
-        same = {key: words for key, words in kept.what.items() if key != "weights gone, scores kept"}
+        same = {key: words for key, words in kept.what.items() if key != GONE}
         assert (kept.ours, kept.spread, kept.beside, same) == (line.ours, line.spread, line.beside, line.what)
     line = line_of(without, "ring, 8 cameras", "POEM v1")
     assert not line.absent
+    assert line.what[GONE] == "0, 1"
+    assert first.notes == without.notes[:-1]
+    made_again = without.notes[-1]
     for seed in (0, 1):
         command = f"poem train synthetic_table:v1 --train.seed {seed}"
-        assert re.search(f"{seed}: no checkpoint in .*{command}", line.what["weights gone, scores kept"])
+        assert len(re.findall(f"- no checkpoint in .*v1-{seed}: {command}", made_again)) == 1
     (missing,) = line_of(without, "ring, 8 cameras", "MvP").absent
     assert "mvp-0" in missing
-    assert "mvp-1" in line_of(without, "ring, 8 cameras", "MvP").what["weights gone, scores kept"]
+    assert line_of(without, "ring, 8 cameras", "MvP").what[GONE] == "1"
+    assert "mvp-1" in made_again
+    assert "mvp-0" not in made_again
 
 
 def test_a_model_that_diverged_costs_its_own_line_alone(result):
