@@ -21,7 +21,7 @@ help:
 	@echo "make test    the default test suite (a quarter to half an hour on 2 cores)"
 	@echo "make lint    ruff and pyright"
 	@echo "make bench   print the speed tables of benchmarks/"
-	@echo "make -j2 synthetic-table   train the systems of the synthetic table: 24 runs, two at a time: 8 h"
+	@echo "make -j2 synthetic-table   train the systems of the synthetic table: 24 runs, two at a time: 5 to 8 h"
 	@echo "make accelerator MINUTES=10   measure a GPU, then train the shipped model on"
 
 setup: $(STAMP)

@@ -9,12 +9,12 @@ What:      one trunk and first stage for all, those of the shipped model, frozen
            v1-wo-proj, v1-wo-pt, v1-g-emb, v1-gv-emb, pe-meshtr, ftl-meshtr, mvp. `make -j2 synthetic-table`
            trains all of them with two seeds.
 Hardware:  one CPU core a run, two runs at a time; the same command uses every GPU or TPU it finds.
-Time:      0.3 h for v2 beside one other run, 0.1 h for mvp, 0.8 h for v1-wo-pt; up to twice as long with
+Time:      0.3 h for v2 beside one other run, 0.2 h for mvp, 0.8 h for v1-wo-pt; up to twice as long with
            other work beside them.
-Expected:  MPVPE at 8 views of the rig: v1 and v1-wo-pt 11 mm, pe-meshtr 21, v2 24, v2-row-major 27, v2-apart
-           29, v1-1stage, mvp and ftl-meshtr above 50, where the mean hand with true root and rotation is at
-           19: most are not trained far enough; key-point fitting on the same heat maps 6.4. See
-           docs/tables.md.
+Expected:  MPVPE at 8 views of the rig: v1 and its ablations but v1-1stage 11 mm, pe-meshtr 21, v2 24,
+           v2-row-major 27, v2-apart 29, the others above 50, where the mean hand with true root and
+           rotation is at 19: most are not trained far enough; key-point fitting on the same heat maps 6.4.
+           See docs/tables.md.
 Command:   poem train synthetic_table
            is v2; poem train synthetic_table:mvp another.
 """
