@@ -68,11 +68,22 @@ def save(
     try:
         (temporary / CONFIG_FILE).write_text(to_json(config) + "\n", encoding="utf-8")
         ocp.save(str((temporary / ARRAYS_FOLDER).resolve()), stored)
+        _forget_where_it_was_written(temporary / ARRAYS_FOLDER)
         write_checksums(temporary / CHECKSUMS_FILE, temporary / ARRAYS_FOLDER)
         temporary.chmod(0o755)
         _put_in_place(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _forget_where_it_was_written(arrays: Path) -> None:
+    """Take the absolute path out of Orbax's mark of success, which names a temporary folder of this machine.
+
+    What counts is that there is such a file.
+    """
+    mark = arrays / "commit_success.txt"
+    if mark.exists():
+        mark.write_text(f"Checkpoint commit was successful to {arrays.name}", encoding="utf-8")
 
 
 def _put_in_place(new: Path, path: Path) -> None:

@@ -250,6 +250,14 @@ def test_another_config_is_told_by_the_fields_that_differ(tmp_path, expected, go
         store.load(tmp_path, expected=expected)
 
 
+def test_a_model_does_not_tell_where_it_was_written(tmp_path, params):
+    store.save(tmp_path / "model", MICRO, params)
+    files = [file for file in (tmp_path / "model").rglob("*") if file.is_file()]
+    assert files
+    assert not [file.name for file in files if str(tmp_path).encode() in file.read_bytes()]
+    store.load(tmp_path / "model")
+
+
 def test_shipped_weights_are_small_and_load():
     config, params = store.shipped()
     assert config.image_hw == (128, 128)
